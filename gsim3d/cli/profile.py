@@ -45,12 +45,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from pathlib import Path
 
-    from gsim3d.profile.report import Options, profile, table
+    from gsim3d.profile.report import profile, table
 
-    given = {name: value for name, value in vars(args).items() if name != "quiet"}
-    options = Options(**{**given, "out": Path(args.out)})
+    options = {name: value for name, value in vars(args).items() if name not in ("out", "quiet")}
     with progress(unit="run", quiet=args.quiet) as bar:
-        content, files = profile(options, lambda doing: (bar.set_description(doing[:60]), bar.update()))
+
+        def advance(doing: str) -> None:
+            bar.set_description(doing[:60], refresh=False)
+            bar.update()
+
+        content, files = profile(out=Path(args.out), progress=advance, **options)
     print(table(content))
     for name, place in content["presets"].items():
         row = content["settings"][place]

@@ -44,7 +44,6 @@ class Setting:
         cutoff: as :func:`gsim3d.ops.rasterize_gaussians`.
         patch_size: largest number of particles that attend to each other; None: the model's.
         grid: factor to the model's cell size.
-        shrink: images are rendered this factor smaller, and enlarged again to be compared.
         least_opacity: Gaussians below it are not drawn; pixels leave out what is below 1/255 in any case.
         sleep: cells that a particle at rest moves in one step at most, and is not computed; None: as in training.
     """
@@ -61,7 +60,6 @@ class Setting:
     cutoff: str = "exact"
     patch_size: int | None = None
     grid: float = 1.0
-    shrink: int = 1
     least_opacity: float = 0.0
     sleep: float | None = None
 
@@ -70,7 +68,7 @@ class Setting:
             if getattr(self, name) not in known:
                 raise InputError(f"{name} must be one of {', '.join(known)}; got {shown(getattr(self, name))}")
         check_ranges(self, kept=(1e-6, 1), grid=(1e-3, 1e3), least_opacity=(0, 1), sleep=(0, 1e3), sh_degree=(0, 3))
-        check_ranges(self, **dict.fromkeys(("context_views", "history", "patch_size", "shrink"), (1, 1e6)))
+        check_ranges(self, **dict.fromkeys(("context_views", "history", "patch_size"), (1, 1e6)))
         if self.captured and self.sleep is not None:
             raise InputError("captured does not fit sleep: a CUDA graph computes every particle")
 

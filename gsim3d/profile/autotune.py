@@ -15,7 +15,7 @@ from gsim3d.evaluate.report import write_json
 from gsim3d.io.files import typed
 from gsim3d.numerics.speed import SPEEDS_FILE, Setting, read_speeds
 from gsim3d.presets import ModelConfig
-from gsim3d.profile.settings import GROUPS, NOT_TUNED, Group
+from gsim3d.profile.settings import GROUPS, Group
 from gsim3d.profile.sweep import MOST_KEPT, PRESETS, BenchmarkCase, Effort, Point, Sweep, tie
 from gsim3d.profile.timing import GAPS, machine
 from gsim3d.state import DYNAMIC
@@ -51,9 +51,16 @@ def autotune(
     sweep = Sweep(case, effort)
     points, _ = sweep.points(groups)
     sweep.run(points)
-    if max_ms is not None:
-        return _most_accurate(sweep, points, max_ms)
-    return fastest(sweep, points, lambda point: point.agreement.psnr >= min_agreement_psnr)
+    if max_ms is None:
+        return fastest(sweep, points, lambda point: point.agreement.psnr >= min_agreement_psnr)
+    usable = [p for p in points if not p.failure]
+    if 1e3 * min(p.step_seconds for p in usable) > max_ms:
+        usable.append(fastest(sweep, points, lambda point: True))  # no setting alone is fast enough
+    within = [p for p in usable if 1e3 * p.step_seconds <= max_ms]
+    if within:
+        return max(within, key=lambda p: p.agreement.psnr)
+    least = 1e3 * min(p.step_seconds for p in usable)
+    raise InputError(f"autotune: no setting takes at most {max_ms:g} ms a step; the fastest takes {least:.3g}")
 
 
 def tune(sweep: Sweep, points: Sequence[Point]) -> dict[str, Point]:
@@ -76,7 +83,7 @@ def keeping(case: BenchmarkCase, reference: Point, share: float) -> Callable[[Po
 
 def fastest(sweep: Sweep, points: Sequence[Point], keeps: Callable[[Point], bool]) -> Point:
     """The reference with every setting that keeps the promise and saves time, added one by one, measured together."""
-    useful = [p for p in points[1:] if p.group not in NOT_TUNED and _saves(p, points) and keeps(p)]
+    useful = [p for p in points[1:] if _saves(p, points) and keeps(p)]
     if not useful:
         return points[0]
     useful.sort(key=lambda p: p.step_seconds)
@@ -116,26 +123,6 @@ def _faster(point: Point, than: Point) -> bool:
     return not point.failure and point.step_seconds < than.step_seconds and not tie(point, than)
 
 
-def _most_accurate(sweep: Sweep, points: Sequence[Point], max_ms: float) -> Point:
-    usable = [p for p in points if not p.failure and p.group not in NOT_TUNED]
-    within = [p for p in usable if 1e3 * p.step_seconds <= max_ms]
-    if within:
-        return max(within, key=lambda p: p.agreement.psnr)
-    best = points[0]  # no setting alone is fast enough: they are added, the nearest to the reference first
-    for point in sorted(usable, key=lambda p: -p.agreement.psnr):
-        both = _both(sweep, best, point)
-        if both is None or not _faster(point, points[0]):
-            continue
-        sweep.run([both])
-        if not both.failure and _faster(both, best):
-            best = both
-        if 1e3 * best.step_seconds <= max_ms:
-            return best
-    raise InputError(
-        f"autotune: no setting takes at most {max_ms:g} ms a step; the fastest takes {1e3 * best.step_seconds:.3g}"
-    )
-
-
 # ---- what is kept beside the weights ----
 
 
@@ -163,7 +150,7 @@ class PartTimes:
 
     @classmethod
     def of(cls, case: BenchmarkCase, reference: Point) -> PartTimes | None:
-        """Of a reference that was timed on ``case``; None where its sections were not told apart."""
+        """Of a reference that was timed on ``case``; None where its sections were not watched."""
         if not reference.sections():
             return None
         parts: dict[str, float] = {}

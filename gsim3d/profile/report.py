@@ -8,7 +8,7 @@ import io
 import shlex
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from html import escape
 from math import log10
 from pathlib import Path
@@ -23,10 +23,11 @@ from gsim3d.evaluate.report import write_json
 from gsim3d.evaluate.scoring import METRICS, measurable
 from gsim3d.io.files import write_whole
 from gsim3d.io.locks import only_one_writer
+from gsim3d.io.terminal import in_columns
 from gsim3d.numerics.speed import SPEEDS_FILE
 from gsim3d.pretrained import located
 from gsim3d.profile.autotune import PartTimes, save_speeds, tune
-from gsim3d.profile.settings import GROUPS, KINDS, NOT_TUNED, Group
+from gsim3d.profile.settings import GROUPS, KINDS, Group
 from gsim3d.profile.sweep import (
     FULL,
     NO_TIME,
@@ -72,43 +73,46 @@ two measurements of one thing differ by. Bold: no other setting is both faster a
 # ---- the command ----
 
 
-@dataclass(frozen=True)
-class Options:
-    """The options of ``gsim3d profile``; see its help."""
+def profile(
+    checkpoint: str,
+    data: str,
+    out: Path,
+    *,
+    scenes: str = "test",
+    preset: str = "quick",
+    settings: Sequence[str] | None = None,
+    metrics: Sequence[str] | None = None,
+    minutes: float | None = None,
+    device: str = "cpu",
+    progress: Callable[[str], None] = lambda doing: None,
+) -> tuple[dict, list[Path]]:
+    """Measures, tunes and writes; what report.json holds, and the files. A call that was ended is gone on with.
 
-    checkpoint: str
-    data: str
-    out: Path
-    scenes: str = "test"
-    preset: str = "quick"
-    settings: Sequence[str] | None = None
-    metrics: Sequence[str] | None = None
-    minutes: float | None = None
-    device: str = "cpu"
-
-
-def profile(options: Options, progress: Callable[[str], None] = lambda doing: None) -> tuple[dict, list[Path]]:
-    """Measures, tunes and writes; (what report.json holds, the files). A call that was ended is gone on with."""
-    limit, quick = TimeLimit(options.minutes and 60 * options.minutes), options.preset == "quick"
-    groups, out, effort = _groups(options.settings), Path(options.out), QUICK if quick else FULL
-    if options.settings is not None:
-        effort = replace(effort, few=False)
-    metrics, not_measured = measurable(options.metrics)
-    if quick and options.metrics is None:
+    Args:
+        checkpoint, data, out, scenes, preset, settings, metrics, minutes, device: the options of ``gsim3d profile``.
+        progress: is called with what is being done.
+    Raises:
+        InputError: an option is wrong, or the reference run has no result.
+    """
+    limit, quick = TimeLimit(minutes and 60 * minutes), preset == "quick"
+    groups = _groups(settings)
+    effort = replace(QUICK if quick else FULL, few=quick and settings is None)
+    measured, not_measured = measurable(metrics)
+    if quick and metrics is None:
         not_measured |= dict.fromkeys(SLOW_METRICS, "slow: named with --metrics, or --preset full")
-        metrics = tuple(name for name in metrics if name not in SLOW_METRICS)
+        measured = tuple(name for name in measured if name not in SLOW_METRICS)
     pyplot()
-    restored = restore(options.checkpoint, options.device)
+    restored = restore(checkpoint, device)
     if out.exists() and not out.is_dir():
         raise InputError(f"--out: {out} is not a folder")
-    case = BenchmarkCase(restored, _scenes(options, restored, effort.n_scenes), effort.n_steps, metrics)
+    case = BenchmarkCase(restored, _scenes(restored, data, scenes, effort.n_scenes), effort.n_steps, measured)
     out.mkdir(parents=True, exist_ok=True)
     with only_one_writer(out):
         sweep = Sweep(case, effort, limit, progress, out / "measured.json")
         points, not_run = sweep.points(groups)
         sweep.run(points)
         if points[0].failure:
-            raise InputError(f"{options.checkpoint}: the reference run has no result: {points[0].failure}")
+            raise InputError(f"{checkpoint}: the reference run has no result: {points[0].failure}")
         for point in (point for point in points if point.failure == NO_TIME):
             before = not_run.get(point.group, "more time than --minutes gave, for")
             not_run[point.group] = f"{before} {point.setting.name};"
@@ -124,7 +128,7 @@ def profile(options: Options, progress: Callable[[str], None] = lambda doing: No
             "not_measured": {**case.not_measured, **not_measured},
         }
         files = write(out, case, points, presets, content)
-        files.append(_keep_speeds(located(options.checkpoint), out, restored, presets, PartTimes.of(case, points[0])))
+        files.append(_keep_speeds(located(checkpoint), out, restored, presets, PartTimes.of(case, points[0])))
     return content, files
 
 
@@ -136,9 +140,9 @@ def _groups(names: Sequence[str] | None) -> Sequence[Group]:
     return GROUPS if names is None else [known[name] for name in names]
 
 
-def _scenes(options: Options, restored: Restored, count: int | None) -> list[Scene]:
-    folders = find_scenes(options.data)
-    folders = folders if options.scenes == "all" else split_scenes(folders)[1] or folders
+def _scenes(restored: Restored, data: str, which: str, count: int | None) -> list[Scene]:
+    folders = find_scenes(data)
+    folders = folders if which == "all" else split_scenes(folders)[1] or folders
     return [restored.open_scene(folder) for folder in folders[:count]]
 
 
@@ -301,15 +305,9 @@ def cells(content: dict, *, plain: bool = False) -> list[list[str]]:
 
 def table(content: dict) -> str:
     """The report for a terminal: a few columns of the table, and what was measured of many scenes."""
-    columns = (1, 3, 4, 8, 9, 11)
-    rows = [[row[n] for n in columns] for row in cells(content)]
-    widths = [max(len(row[n]) for row in rows if not row[1].startswith("failed")) for n in range(len(columns))]
-    lines = []
-    for row in rows:
-        failed = row[1].startswith("failed")
-        texts = [row[1]] if failed else [text.rjust(width + 2) for text, width in zip(row[1:], widths[1:])]
-        lines.append(row[0].ljust(widths[0] + 2) + "".join(texts))
-    return "\n".join([*lines, *throughput_in_words(content)])
+    rows = [[row[n] for n in (1, 3, 4, 8, 9, 11)] for row in cells(content)]
+    rows = [[*row[:1], "failed", *row[2:]] if row[1].startswith("failed") else row for row in rows]
+    return "\n".join([in_columns(rows), *throughput_in_words(content)])
 
 
 def throughput_in_words(content: dict) -> list[str]:
@@ -381,7 +379,7 @@ def cost_figure(points: Sequence[Point], case: BenchmarkCase, presets: dict[str,
         return min(MOST_LOSS, max(LEAST_LOSS, 1 - shares[id(point)]))
 
     figure, axes = pyplot().subplots(figsize=(9.5, 6.4), layout="constrained")
-    best = front([p for p in usable if p.group not in NOT_TUNED], lost)
+    best = front(usable, lost)
     _draw_points(axes, points, usable, best, lost, {id(p) for p in presets.values()})
     axes.set(xscale="log", yscale="log", ylabel="share of the gain that is lost")
     axes.set_xlabel("time of a simulated step and its images [ms]; bars: rounds differ by so much")
@@ -393,7 +391,7 @@ def cost_figure(points: Sequence[Point], case: BenchmarkCase, presets: dict[str,
     for share, text in PROMISED.items():
         axes.axhline(1 - share, color="#444444", linewidth=1, linestyle="--", zorder=1)
         axes.text(1.005, 1 - share, text, transform=axes.get_yaxis_transform(), va="center", fontsize=9)
-    _mark_presets(axes, presets, points[0], lost, shares)
+    _mark_presets(axes, {name: p for name, p in presets.items() if p in usable}, points[0], lost)
     gain = case.gain(points[0])
     whole = "" if gain is None else f" (the gain: {gain:.2f} dB over particles held still)"
     axes.set_title(f"What 99.9 % and 99 % of the model's gain cost{whole}", fontsize=11)
@@ -426,25 +424,17 @@ def _draw_points(axes, points, usable, best, error: Callable[[Point], float], ma
     axes.legend(fontsize=7.5, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.1))
 
 
-def _mark_presets(axes, presets: dict[str, Point], reference: Point, lost, shares: dict[int, float | None]) -> None:
-    names: dict[Point, list[str]] = {}
-    for name, point in presets.items():
-        if shares.get(id(point)) is not None:
-            names.setdefault(point, []).append(name)
-    for place, point in enumerate(sorted(names, key=lambda p: p.step_seconds)):
+def _mark_presets(axes, presets: dict[str, Point], reference: Point, lost: Callable[[Point], float]) -> None:
+    """A star on each preset, and a box that says what it is."""
+    for place, point in enumerate(sorted(set(presets.values()), key=lambda p: p.step_seconds)):
         x, y = 1e3 * point.step_seconds, lost(point)
         axes.plot(x, y, "*", color="#e0a030", markersize=18, markeredgecolor="#444444", zorder=5)
-        text = f"{' = '.join(names[point])}: {x:.3g} ms a step"
-        if point is not reference:
-            faster = reference.step_seconds / point.step_seconds
-            kept = f"keeps {100 * min(1, shares[id(point)]):.2f} %, {faster:.2f} times as fast"
-            text = "\n".join([text, *wrap(point.setting.name, 36), kept])
-        axes.annotate(
-            text, (x, y), (0.015 + 0.345 * place, 0.98), textcoords="axes fraction", va="top", fontsize=8.5,
-            zorder=6,
-            bbox={"boxstyle": "round", "facecolor": "#fff8e8", "edgecolor": "#e0a030"},
-            arrowprops={"arrowstyle": "-", "color": "#e0a030", "linewidth": 1},
-        )  # fmt: skip
+        names = " = ".join(name for name, chosen in presets.items() if chosen is point)
+        faster = reference.step_seconds / point.step_seconds
+        text = "\n".join([f"{names}: {x:.3g} ms, {faster:.2f} times as fast", *wrap(point.setting.name, 36)])
+        box = {"boxstyle": "round", "facecolor": "#fff8e8", "edgecolor": "#e0a030"}
+        at = {"xytext": (0.015 + 0.345 * place, 0.98), "textcoords": "axes fraction", "va": "top"}
+        axes.annotate(text, (x, y), **at, fontsize=8.5, bbox=box, arrowprops={"arrowstyle": "-", "color": "#e0a030"})
 
 
 def _plain_times(axes) -> None:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from gsim3d.cameras import Cameras, Frames
@@ -111,9 +108,7 @@ class Runner:
         if self.setting.least_opacity:
             particles = particles.select_rows(particles.opacities >= self.setting.least_opacity)
         with self.setting.precision("renderer", self.device.type):
-            rendering = self.simulator._draw(
-                particles, self._smaller(cameras), plan=self.plan, cutoff=self.setting.cutoff
-            )
+            rendering = self.simulator._draw(particles, cameras, plan=self.plan, cutoff=self.setting.cutoff)
         return rendering.color.float().clamp(0, 1)
 
     @torch.no_grad()
@@ -163,26 +158,11 @@ class Runner:
 
     def captured(self, state: Particles, n_steps: int, cameras: Cameras) -> CapturedRollout:
         """The rollout of ``state`` as a graph, in the precision of the dynamics; it draws where it can."""
-        drawn = self._smaller(cameras) if self.draws_in_graph else None
+        drawn = cameras if self.draws_in_graph else None
         with self.setting.precision("dynamics", self.device.type):
             return CapturedRollout(
                 self.simulator, state, n_steps, self.plan, cameras=drawn, copies=False, cutoff=self.setting.cutoff
             )
-
-    def _smaller(self, cameras: Cameras) -> Cameras:
-        factor = self.setting.shrink
-        if factor == 1:
-            return cameras
-        width, height = math.ceil(cameras.width / factor), math.ceil(cameras.height / factor)
-        scale = torch.tensor([width / cameras.width, height / cameras.height, 1.0], device=cameras.Ks.device)
-        return dataclasses.replace(cameras, Ks=cameras.Ks * scale[:, None], width=width, height=height)
-
-
-def enlarged(images: Tensor, height: int, width: int) -> Tensor:
-    """Images of a setting that shrinks them, in their full size."""
-    if images.shape[1:3] == (height, width):
-        return images
-    return F.interpolate(images.permute(0, 3, 1, 2), (height, width), mode="bilinear").permute(0, 2, 3, 1)
 
 
 def _spread(cams: Sequence[int], count: int) -> list[int]:
@@ -275,6 +255,4 @@ GROUPS = (
     Group("sleep", "near-exact", lambda case: [Setting(sleep=cells) for cells in (1e-3, 1e-2, 0.1)], few=1),
     Group("patch size", "model", _patches, "patches of more than 32 particles", few=1),
     Group("grid size", "model", lambda case: [Setting(grid=factor) for factor in (0.5, 2.0)]),
-    Group("image size", "exact", lambda case: [Setting(shrink=2)]),
 )
-NOT_TUNED = ("image size",)  # what is looked at, not what is simulated

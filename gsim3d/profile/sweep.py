@@ -29,7 +29,7 @@ from gsim3d.evaluate.scoring import METRICS, PLAIN_METRICS, SceneScores, SceneTr
 from gsim3d.io.files import MAX_TEXT, read_file, typed
 from gsim3d.io.plain import parse_json
 from gsim3d.numerics.speed import Setting
-from gsim3d.profile.settings import GROUPS, Group, Runner, enlarged
+from gsim3d.profile.settings import GROUPS, Group, Runner
 from gsim3d.profile.timing import (
     GAPS,
     SECTIONS,
@@ -39,7 +39,6 @@ from gsim3d.profile.timing import (
     Timing,
     machine,
     medians_of,
-    peak_memory,
     time_call,
     watched,
 )  # fmt: skip
@@ -117,7 +116,7 @@ class Point:
         by_step: metric -> its value at each step.
         encode, step: timings of the input's encoding, and of one simulated step and its images; one a round.
         once: seconds before the first step (capture of a graph).
-        peak: bytes, of the GPU; on a CPU of the process so far.
+        peak: bytes of the GPU that a step takes beside the model and its input; 0 on a CPU.
         resting: share of the particles that slept.
     """
 
@@ -262,7 +261,7 @@ class BenchmarkCase:
 
     def predict(self, setting: Setting, number: int) -> Rollout:
         """The whole horizon of one scene. Raises Failed: memory ran out, or a number is not finite."""
-        runner, scene, log = self.runner(setting), self.scenes[number], RestLog()
+        runner, log = self.runner(setting), RestLog()
         images, moving = [], []
         try:
             for step, newest in enumerate(runner.steps(self.start(runner, [number]), self.n_steps, log)):
@@ -271,7 +270,7 @@ class BenchmarkCase:
                 image = runner.images(newest, self.cameras([number], step))
                 if not image.isfinite().all():
                     raise Failed(f"images are not finite at step {step + 1}")
-                images.append(enlarged(image, scene.height, scene.width))
+                images.append(image)
                 moving.append(newest.means[newest.activity == DYNAMIC])
         except torch.OutOfMemoryError:
             raise Failed("out of memory") from None
@@ -484,10 +483,10 @@ class Sweep:
                 if self.limit.is_over(COMPARE) and point.setting != Setting():
                     point.failure = NO_TIME
                     continue
-                with peak_memory(self.case.device) as peak:
-                    self.case.compare(point)
-                point.peak = peak() if self.case.device.type == "cpu" else 0  # a GPU's also holds the comparison's
+                self.case.compare(point)
                 self._save()
+                if point.failure and point.setting == Setting():
+                    return
         for n in range(self.effort.n_rounds):
             if n and self.limit.is_over(ROUNDS):
                 break
@@ -534,14 +533,13 @@ class Sweep:
         free, total = torch.cuda.mem_get_info(case.device)
         if free < total / 2:
             self._graphs.clear()
-        held = _bytes_of(case.runner(setting), case.start(case.runner(setting), [0]))
+        torch.cuda.reset_peak_memory_stats(case.device)
         before = torch.cuda.memory_allocated(case.device)
-        with peak_memory(case.device) as peak:
-            stepping = self._graphs.get(setting) or Stepping(case, setting, self.clock)
-            if setting.captured:
-                self._graphs[setting], point.once = stepping, point.once or stepping.once
-            timing = time_call(stepping, self.clock, effort.repeats, effort.warm_up)
-            point.peak = max(point.peak, peak() - before + held)
+        stepping = self._graphs.get(setting) or Stepping(case, setting, self.clock)
+        if setting.captured:
+            self._graphs[setting], point.once = stepping, point.once or stepping.once
+        timing = time_call(stepping, self.clock, effort.repeats, effort.warm_up)
+        point.peak = max(point.peak, torch.cuda.max_memory_allocated(case.device) - before)
         if not point.step and setting.sleep is None:
             timing = Timing(timing.repeats, self.sections_of_graph(setting, timing))
         return timing.split_over(span)
@@ -587,8 +585,3 @@ class Sweep:
         except (ValueError, AttributeError, KeyError, TypeError):  # of another version: nothing but time is lost
             return {}
         return {point.setting: point for point in points} if content == self._conditions() else {}
-
-
-def _bytes_of(runner: Runner, state: Particles) -> int:
-    tensors = [*runner.simulator.parameters(), *state.row_fields().values()]
-    return sum(tensor.numel() * tensor.element_size() for tensor in tensors)

@@ -1,10 +1,9 @@
-"""Where the time of a call goes: medians of many repeats, sections told apart by the ops they run, and the machine."""
+"""Where the time of a call goes: medians of many repeats, sections by the ops they run, and the machine."""
 
 from __future__ import annotations
 
 import hashlib
 import platform
-import resource
 import statistics
 import subprocess
 import time
@@ -13,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 
@@ -40,28 +39,6 @@ PACKAGE = Path(gsim3d.__file__).parent
 # ---- clocks ----
 
 
-class Clock(Protocol):
-    """What a stopwatch reads."""
-
-    def wait(self) -> None:
-        """Returns once the device has done all its work."""
-
-    def now(self) -> float:
-        """Seconds of the host."""
-
-    def mark(self) -> Any:
-        """The current point in the device's work; in a capture, a point in the work of every replay."""
-
-    def capturing(self) -> bool:
-        """Whether a graph is being captured."""
-
-    def mark_cost(self) -> float:
-        """Seconds that a mark in a graph adds to it."""
-
-    def seconds(self, first: Any, last: Any) -> float:
-        """Between two marks that the device has passed."""
-
-
 class DeviceClock:
     """The clock of the CPU or of a GPU, whose marks are events."""
 
@@ -70,13 +47,16 @@ class DeviceClock:
         self._mark_cost: float | None = None
 
     def wait(self) -> None:
+        """Returns once the device has done all its work."""
         if self._gpu is not None:
             torch.cuda.synchronize(self._gpu)
 
     def now(self) -> float:
+        """Seconds of the host."""
         return time.perf_counter()
 
     def mark(self) -> Any:
+        """The current point in the device's work; in a capture, a point in the work of every replay."""
         if self._gpu is None:
             return time.perf_counter()
         event = torch.cuda.Event(enable_timing=True, external=self.capturing())
@@ -84,9 +64,11 @@ class DeviceClock:
         return event
 
     def capturing(self) -> bool:
+        """Whether a graph is being captured."""
         return self._gpu is not None and torch.cuda.is_current_stream_capturing()
 
     def mark_cost(self) -> float:
+        """Seconds that a mark in a graph adds to it."""
         if self._gpu is None:
             return 0.0
         if self._mark_cost is None:
@@ -114,6 +96,7 @@ class DeviceClock:
         return self.seconds(marks[0], marks[-1])
 
     def seconds(self, first: Any, last: Any) -> float:
+        """Between two marks that the device has passed."""
         if self._gpu is None:
             return last - first
         last.synchronize()
@@ -135,7 +118,7 @@ class Stopwatch:
         seconds: by section, of the last call.
     """
 
-    def __init__(self, clock: Clock):
+    def __init__(self, clock: DeviceClock):
         self.seconds: dict[str, float] = {}
         self._clock = clock
         self._marks: list[tuple[str, Any]] = []
@@ -294,11 +277,11 @@ class Timing:
         return Timing(tuple(seconds / n_steps for seconds in self.repeats), sections)
 
 
-def time_call(call: Callable[[], Any], clock: Clock, repeats: int, warm_up: int = 1, sections=None) -> Timing:
+def time_call(call: Callable[[], Any], clock: DeviceClock, repeats: int, warm_up: int = 1, sections=None) -> Timing:
     """Times ``call``, each time from an idle device to an idle device; the first ``warm_up`` do not count.
 
     Args:
-        sections: gives those of the call that has just ended; None: they are not told apart.
+        sections: gives those of the call that has just ended; None: they are not watched.
     """
     seconds, found = [], []
     for n in range(warm_up + repeats):
@@ -318,24 +301,13 @@ def medians_of(found: list[dict[str, float]]) -> dict[str, float]:
     return {name: statistics.median(sections.get(name, 0.0) for sections in found) for name in names}
 
 
-@contextmanager
-def peak_memory(device: torch.device) -> Iterator[Callable[[], int]]:
-    """A function that says how many bytes were allocated at most in the block; on a CPU, by the process so far."""
-    if device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats(device)
-        yield lambda: torch.cuda.max_memory_allocated(device)
-    else:
-        yield lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-
-
 # ---- the machine ----
 
 
 def machine(device: torch.device) -> dict[str, str]:
-    """What numbers were measured on, and with: the commit where git knows it, and a hash of the package's sources."""
+    """What numbers were measured on, and with; "sources" is a hash of the package's Python files."""
     found = {
         "gsim3d": gsim3d.__version__,
-        "commit": _commit(),
         "sources": _hash_of_sources(),
         "torch": torch.__version__,
         "python": platform.python_version(),
@@ -344,24 +316,7 @@ def machine(device: torch.device) -> dict[str, str]:
         found |= {"device": torch.cuda.get_device_name(device), "cuda": torch.version.cuda, "driver": _driver(device)}
     else:
         found |= {"device": f"CPU, {torch.get_num_threads()} threads", "processor": _processor()}
-    return {name: value for name, value in found.items() if value}
-
-
-def _said(*words: str) -> str:
-    """What a program prints; "" where it fails."""
-    try:
-        return subprocess.run(words, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return ""
-
-
-def _commit() -> str:
-    """Of the checkout that this package is in, with "+" where it was changed; "" outside of one."""
-    git = ("git", "-C", str(PACKAGE.parent))
-    root = _said(*git, "rev-parse", "--show-toplevel")
-    if not root or Path(root).resolve() != PACKAGE.parent.resolve():
-        return ""
-    return _said(*git, "rev-parse", "--short=12", "HEAD") + "+" * bool(_said(*git, "status", "--porcelain", "-uno"))
+    return found
 
 
 def _hash_of_sources() -> str:
@@ -380,7 +335,15 @@ def _processor() -> str:
 
 
 def _driver(device: torch.device) -> str:
-    """Its version and the clocks of the GPU, as nvidia-smi prints them."""
-    uuid = getattr(torch.cuda.get_device_properties(device), "uuid", None)
-    query = "--query-gpu=driver_version,clocks.gr,clocks.mem"
-    return _said("nvidia-smi", f"--id=GPU-{uuid}", query, "--format=csv,noheader") if uuid else ""
+    """Its version and the clocks of the GPU, as nvidia-smi prints them; "" where it does not."""
+    uuid = torch.cuda.get_device_properties(device).uuid
+    query = [
+        "nvidia-smi",
+        f"--id=GPU-{uuid}",
+        "--query-gpu=driver_version,clocks.gr,clocks.mem",
+        "--format=csv,noheader",
+    ]
+    try:
+        return subprocess.run(query, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return ""

@@ -57,7 +57,7 @@ def test_settings_are_replayed_on_a_gpu_where_they_fit_a_graph():
     [
         ({"encoder": "fp8"}, "encoder"),
         ({"kept": 0}, "kept"),
-        ({"shrink": 0}, "shrink"),
+        ({"history": 0}, "history"),
         ({"no": 1}, "no"),
         ({"kept": "half"}, "kept must be a number"),
         ({"captured": 1}, "captured must be true or false"),

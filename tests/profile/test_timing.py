@@ -1,7 +1,6 @@
 """Timings and their sections, on a clock that moves with the work of a fake device."""
 
 import re
-import subprocess
 
 import pytest
 import torch
@@ -123,25 +122,3 @@ def test_machine_names_device_and_sources():
     facts = timing.machine(torch.device("cpu"))
     assert facts["device"].startswith("CPU, ") and facts["processor"]
     assert re.fullmatch("[0-9a-f]{12}", facts["sources"]) and facts["torch"] == torch.__version__
-
-
-def test_commit_is_that_of_the_checkout(tmp_path, monkeypatch):
-    package = tmp_path / "checkout" / "gsim3d"
-    package.mkdir(parents=True)
-    (package / "a.py").write_text("1\n")
-    monkeypatch.setattr(timing, "PACKAGE", package)
-    assert timing._commit() == ""  # not in a checkout of its own
-
-    def git(*words):
-        author = ["-c", "user.name=a", "-c", "user.email=a@b"]
-        run = ["git", "-C", package.parent, *author, *words]
-        return subprocess.run(run, check=True, capture_output=True, text=True).stdout
-
-    git("init", "-q")
-    git("add", ".")
-    git("commit", "-qm", "first")
-    commit = git("rev-parse", "--short=12", "HEAD").strip()
-    assert timing._commit() == commit
-    before = timing._hash_of_sources()
-    (package / "a.py").write_text("2\n")
-    assert timing._commit() == commit + "+" and timing._hash_of_sources() != before
