@@ -7,8 +7,9 @@ Units are metres and pixels; axes are OpenCV's (x right, y down, z forward).
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, Self
 
 import torch
 from torch import Tensor
@@ -17,26 +18,31 @@ from torch import Tensor
 class TensorRecord:
     """Moves and selects all tensors of a dataclass together."""
 
-    def map(self, f):
+    def map(self, f: Callable[[Tensor], Tensor]) -> Self:
         """The same object with ``f`` applied to every tensor."""
         return dataclasses.replace(self, **{k: f(v) for k, v in vars(self).items() if isinstance(v, Tensor)})
 
-    def to(self, device):
+    def to(self, device: str | torch.device) -> Self:
+        """The same on ``device``."""
         return self.map(lambda t: t.to(device))
 
-    def detach(self):
+    def detach(self) -> Self:
+        """The same without gradients."""
         return self.map(lambda t: t.detach() if t.is_floating_point() else t)
 
 
 @dataclass(frozen=True)
 class Cameras(TensorRecord):
-    """Calibrated pinhole cameras, one row an image.
+    """Calibrated pinhole cameras, one for each image.
 
-    viewmats: [I, 4, 4] world-to-camera, OpenCV axes.
-    Ks: [I, 3, 3] in pixels, full principal point, pixel centres at +0.5.
-    near, far: [I] metres, depth range in which the scene lies.
-    image_cloud: int64 [I], the cloud that each image shows.
-    width, height: pixels, the same for all images of one call.
+    Attributes:
+        viewmats: [I, 4, 4] world-to-camera, OpenCV axes.
+        Ks: [I, 3, 3] in pixels, full principal point, pixel centres at +0.5.
+        near: [I] metres, where the depth range of the scene begins.
+        far: [I] metres, where it ends.
+        image_cloud: int64 [I], the cloud that each image shows.
+        width: pixels, the same for all images of one call.
+        height: pixels.
     """
 
     viewmats: Tensor
@@ -51,7 +57,12 @@ class Cameras(TensorRecord):
         return self.viewmats.shape[0]
 
     def select(self, images: Tensor, image_cloud: Tensor | None = None) -> Cameras:
-        """The cameras of rows ``images``; ``image_cloud`` replaces the cloud ids where given."""
+        """Some of the cameras.
+
+        Args:
+            images: int64, which.
+            image_cloud: int64, clouds that they show; None: as before.
+        """
         return Cameras(
             self.viewmats[images],
             self.Ks[images],
@@ -65,16 +76,18 @@ class Cameras(TensorRecord):
 
 @dataclass(frozen=True)
 class Frames(TensorRecord):
-    """Images of calibrated cameras: what the simulator sees.
+    """Images of calibrated cameras, the input of the simulator.
 
-    images: float32 [I, 3, H, W] in [0, 1].
-    cameras: I rows; images of one cloud are its views, any number of them.
-    cloud_scene, cloud_step: int64 [Q]; clouds are sorted by (scene, step), steps of a scene count from 0.
-    origin: float64 [B, 3] metres, lower corner of each scene's workspace; voxels are counted from it.
-    masks: bool [I, H, W], pixels that become particles; None: all.
-    dynamic: bool [I, H, W], pixels of bodies that may move; None: all.
-    valid: bool [I, H, W], pixels that were filmed: no padding; losses look at no others; None: all.
-    world_offset: float64 [B, 3] metres, as of Particles.
+    Attributes:
+        images: float32 [I, 3, H, W] in [0, 1].
+        cameras: of the I images; images of one cloud are its views, any number of them.
+        cloud_scene: int64 [Q]; clouds are sorted by (scene, step).
+        cloud_step: int64 [Q], steps of a scene count from 0.
+        origin: float64 [B, 3] metres, lower corner of each scene's workspace; voxels are counted from it.
+        masks: bool [I, H, W], pixels that become particles; None: all.
+        dynamic: bool [I, H, W], pixels of bodies that may move; None: all.
+        valid: bool [I, H, W], pixels that were recorded: no padding; losses compare no others; None: all.
+        world_offset: float64 [B, 3] metres, as of Particles.
     """
 
     images: Tensor
@@ -87,7 +100,8 @@ class Frames(TensorRecord):
     valid: Tensor | None = None
     world_offset: Tensor | None = None
 
-    def to(self, device):
+    def to(self, device: str | torch.device) -> Frames:
+        """The same on ``device``."""
         return dataclasses.replace(super().to(device), cameras=self.cameras.to(device))
 
     def subsample(self, background_stride: int, body_stride: int) -> Frames:
@@ -141,4 +155,10 @@ class FrameSource(Protocol):
     """Anything that shows scenes to a simulator, such as :class:`gsim3d.data.Scene`."""
 
     def input_frames(self, inputs: InputSpec) -> Frames:
-        """The first ``inputs.history`` steps, from ``inputs.context_views`` cameras of ``inputs.image_size``."""
+        """Input images.
+
+        Args:
+            inputs: of the simulator: how many steps and views, of which size.
+        Returns:
+            The first ``inputs.history`` steps of one scene or several.
+        """

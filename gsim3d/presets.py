@@ -12,7 +12,14 @@ from gsim3d.numerics.policy import StabilityConfig
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """The three parts of a simulator, which must agree on the particles that pass between them, and their limits."""
+    """The three parts of a simulator, which must agree on the particles that pass between them, and their limits.
+
+    Attributes:
+        encoder: images to particles.
+        dynamics: particles to particles of the next step.
+        renderer: particles to Gaussians.
+        stability: limits, and what happens beyond them.
+    """
 
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     dynamics: DynamicsConfig = field(default_factory=DynamicsConfig)

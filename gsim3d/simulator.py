@@ -49,7 +49,7 @@ from gsim3d.errors import InputError
 from gsim3d.io import checkpoint
 from gsim3d.math.spherical_harmonics import SH_0
 from gsim3d.nn.gaussian_head import GaussianHead, render
-from gsim3d.nn.multiview_encoder import Encoder, Room, pixel_rows
+from gsim3d.nn.multiview_encoder import Encoder, StaticShapes, pixel_rows
 from gsim3d.numerics.policy import OnInvalid, check_on_invalid
 from gsim3d.numerics.report import StabilityReport
 from gsim3d.numerics.speed import Setting, load_speed
@@ -213,24 +213,32 @@ class Simulator(nn.Module):
         *,
         on_invalid: OnInvalid | None = None,
         report: StabilityReport | None = None,
-        room: Room | None = None,
+        shapes: StaticShapes | None = None,
     ) -> Particles:
-        """Particles of all clouds of ``frames``: each pixel that the masks keep becomes one.
+        """Particles of all clouds of ``frames``: each pixel inside the masks becomes one.
 
-        room: as of ``encoder``.
+        Args:
+            frames: input images.
+            on_invalid: policy for numbers that cannot be used; None: the model's.
+            report: counts such numbers; None: ``self.report``.
+            shapes: of :meth:`gsim3d.nn.multiview_encoder.Encoder.static_shapes`: nothing then waits for the device.
+        Returns:
+            The particles, cloud by cloud.
+        Raises:
+            InputError, NumericalError: ``frames`` cannot be read; the message names the field and where.
         """
         guard = self._guard("encode", on_invalid, report)
         config = guard.keywords["config"]
-        if room is None:
+        if shapes is None:
             self.encoder.check(frames, pixels=config.on_invalid == "raise")
         frames, spoiled = validate_frames(frames, config, guard.keywords["report"], "encode")
-        particles = self.encoder(frames, room, check=False)
+        particles = self.encoder(frames, shapes, check=False)
         if spoiled is not None:
-            particles = drop_particles(particles, pixel_rows(frames, spoiled, room))
+            particles = drop_particles(particles, pixel_rows(frames, spoiled, shapes))
         particles = guard(particles)
         particles = self.dynamics.with_bodies(particles)
         if (dynamics := self.config.dynamics).velocity:
-            n_views = None if room is None else len(frames.cameras) // particles.n_clouds
+            n_views = None if shapes is None else len(frames.cameras) // particles.n_clouds
             flight = self.dynamics.flight(particles)
             sizes = dynamics.motion_length, dynamics.grid_size, 2**dynamics.history_bits
             velocity = follow(particles, frames, *sizes, n_views, flight and flight.falls)
@@ -271,8 +279,12 @@ class Simulator(nn.Module):
 
         Args:
             state: last steps of every scene.
-            plan: what to compute; default everything the model can. Nobody sleeps: that is decided along a rollout.
+            plan: what to compute; None: that of :meth:`plan`. No particle sleeps: that is decided along a rollout.
             generator: randomness of training (drop path, curve shuffling); None: none.
+            on_invalid: policy for numbers that cannot be used; None: the model's.
+            report: counts such numbers; None: ``self.report``.
+        Returns:
+            The last steps of every scene, the new one included.
         """
         plan, guard = plan or self.plan(), self._guard("step", on_invalid, report)
         self._check(state, "step")

@@ -82,16 +82,17 @@ def curve_sort(codes: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True)
 class PyramidSpec:
-    """The shape of the dynamics network, as far as geometry depends on it. S stages, S - 1 transitions.
+    """The shape of the dynamics network, as far as geometry depends on it. S levels, S - 1 transitions.
 
-    grid_size: metres, edge of a cell at stage 0.
-    slot_bits: time slots of a cloud are in [0, 2^slot_bits).
-    strides: per transition, a power of two; cells of the next stage are that many cells wide.
-    merge_windows: per transition, a power of two; that many neighbouring slots of a scene become one cloud.
-    patch_sizes: per stage, rows that attend to each other.
-    kernel_sizes: per stage, odd sizes of the convolutions that run there.
-    release: the published model's cells and ties: counted from the minimum over all clouds of the call and truncated,
-        curve depth from the extent, equal codes by row. Clouds of one call then change each other.
+    Attributes:
+        grid_size: metres, edge of a cell at level 0.
+        slot_bits: time slots of a cloud are in [0, 2^slot_bits).
+        strides: per transition, a power of two; cells of the next level are that many cells wide.
+        merge_windows: per transition, a power of two; that many neighbouring slots of a scene become one cloud.
+        patch_sizes: per level, rows that attend to each other.
+        kernel_sizes: per level, odd sizes of the convolutions that run there.
+        release: the published model's cells and ties: counted from the minimum over all clouds of the call and
+            truncated, curve depth from the extent, equal codes by row. Clouds of one call then change each other.
     """
 
     grid_size: float
@@ -104,6 +105,7 @@ class PyramidSpec:
 
     @property
     def n_stages(self) -> int:
+        """Levels."""
         return len(self.patch_sizes)
 
     def merged_bits(self) -> tuple[int, ...]:
@@ -117,7 +119,12 @@ class PyramidSpec:
 
 @dataclass(frozen=True)
 class Segments:
-    """Segment s holds rows[cu_rows[s]] .. rows[cu_rows[s + 1] - 1]. rows int64 [R], cu_rows int64 [M + 1]."""
+    """Segment s holds rows[cu_rows[s]] .. rows[cu_rows[s + 1] - 1].
+
+    Attributes:
+        rows: int64 [R].
+        cu_rows: int64 [M + 1].
+    """
 
     rows: Tensor
     cu_rows: Tensor
@@ -127,8 +134,10 @@ class Segments:
 class Voxels:
     """Rows of equal cloud and cell; V voxels, ordered by (cloud, x, y, z).
 
-    row_voxel: int64 [N].
-    rows: int64 [N], the rows of voxel 0, then of voxel 1, ..., ascending in a voxel.   cu_rows: int64 [V + 1].
+    Attributes:
+        row_voxel: int64 [N].
+        rows: int64 [N], the rows of voxel 0, then of voxel 1, ..., ascending in a voxel.
+        cu_rows: int64 [V + 1].
     """
 
     row_voxel: Tensor
@@ -138,12 +147,17 @@ class Voxels:
 
 @dataclass(frozen=True)
 class KernelMap:
-    """Pairs of neighbouring voxels of a convolution with ``kernel_size`` K, sorted by tap, then by tap_out and tap_in.
+    """Pairs of neighbouring voxels of a convolution, sorted by tap, then by tap_out and tap_in.
 
     Pairs cu_taps[t] .. cu_taps[t + 1] - 1 belong to tap t = (kx K + ky) K + kz: voxel tap_in lies at the offset
     (kx, ky, kz) - K // 2 cells from voxel tap_out. The centre tap is empty: it reads the row itself.
-    tap_in, tap_out: int64 [L].   cu_taps: int64 [K^3 + 1].
-    plan: int32, what 16-bit convolutions on CUDA derive from the pairs, made once; they make it anew where it is None.
+
+    Attributes:
+        kernel_size: K.
+        tap_in: int64 [L].
+        tap_out: int64 [L].
+        cu_taps: int64 [K^3 + 1].
+        plan: int32, what 16-bit convolutions on CUDA derive from the pairs, made once; None: made anew in each.
     """
 
     kernel_size: int
@@ -155,9 +169,13 @@ class KernelMap:
 
 @dataclass(frozen=True)
 class PatchTable:
-    """Patch p asks with rows q_rows[cu_q[p]:cu_q[p + 1]] and reads rows kv_rows[cu_k[p]:cu_k[p + 1]].
+    """Patch p has queries q_rows[cu_q[p]:cu_q[p + 1]] and keys kv_rows[cu_k[p]:cu_k[p + 1]].
 
-    q_rows: int64 [N].   kv_rows: int64 [M].   cu_q, cu_k: int64 [P + 1].
+    Attributes:
+        q_rows: int64 [N].
+        kv_rows: int64 [M].
+        cu_q: int64 [P + 1].
+        cu_k: int64 [P + 1].
     """
 
     q_rows: Tensor
@@ -168,16 +186,20 @@ class PatchTable:
 
 @dataclass(frozen=True)
 class Stage:
-    """Geometry of the N rows of one stage, in C clouds.
+    """Geometry of the N rows of one level, in C clouds.
 
-    grid: int64 [N, 3].   cloud: int64 [N], dense ids ascending by (scene, slot left after merging).
-    cu_clouds: int64 [C + 1]; order[:, cu_clouds[c]:cu_clouds[c + 1]] are the rows of cloud c.
-    order: int64 [4, N], rows along each serialization, clouds one after another.
-    patches: attention patches of each serialization. A cloud is cut from its start; its last patch reads the last
-        ``patch_size`` rows of the cloud (all rows where it has fewer).
-    voxels, kernel_maps: convolution geometry, by kernel size.
-    cluster: rows of the stage before that each row pools; None at stage 0.
-    time_index: int64 [N], slot inside the merged window; None where no slots merge.
+    Attributes:
+        grid: int64 [N, 3].
+        cloud: int64 [N], dense ids ascending by (scene, slot left after merging).
+        cu_clouds: int64 [C + 1]; order[:, cu_clouds[c]:cu_clouds[c + 1]] are the rows of cloud c.
+        order: int64 [4, N], rows along each serialization, clouds one after another.
+        patches: attention patches of each serialization. A cloud is cut from its start; its last patch reads the last
+            ``patch_size`` rows of the cloud (all rows where it has fewer).
+        voxels: convolution geometry.
+        kernel_maps: the same, by kernel size.
+        cluster: rows of the level before that each row pools; None at level 0.
+        time_index: int64 [N], slot inside the merged window; None where no slots merge.
+        n_data: rows that the data has, the first ones; None: not known to the host.
     """
 
     grid: Tensor
@@ -189,26 +211,32 @@ class Stage:
     kernel_maps: dict[int, KernelMap]
     cluster: Segments | None
     time_index: Tensor | None
-    n_data: int | None = None  # rows that the data has, the first ones; None: not known to the host
+    n_data: int | None = None
 
     @property
     def n_rows(self) -> int:
+        """N."""
         return self.grid.shape[0]
 
     @property
     def n_clouds(self) -> int:
+        """C."""
         return self.cu_clouds.shape[0] - 1
 
 
 @dataclass(frozen=True)
 class Pyramid:
-    """rows: int64 [N0], the input rows that take part, ascending; cu_rows: int64 [N0 + 1], row i of stage 0 is input
-    row rows[cu_rows[i]]; stages: finest first.
+    """All geometry of a call of the dynamics network.
 
-    found: of a pyramid of given capacity, or of rounded sizes, int64: 0 where it fits (see
-    :meth:`PyramidCapacity.fits`), then the counts that the data has. Sizes are then those of the capacity. Behind the
-    data follow rows that nothing reads: no cluster, patch or pair lists them, each is a voxel of its own, pooled to 0;
-    ``rows`` lists those that sleep. Everything is such a row where a count exceeds its capacity.
+    Attributes:
+        rows: int64 [N0], the input rows that take part, ascending.
+        cu_rows: int64 [N0 + 1]; row i of level 0 is input row rows[cu_rows[i]].
+        stages: the levels, finest first.
+        found: of a pyramid of given capacity, or of rounded sizes, int64: 0 where it fits (see
+            :meth:`PyramidCapacity.fits`), then the counts that the data has. Sizes are then those of the capacity.
+            Behind the data follow padding rows that nothing reads: no cluster, patch or pair lists them, each is a
+            voxel of its own, pooled to 0; ``rows`` lists those that sleep. All rows are such where a count exceeds its
+            capacity.
     """
 
     rows: Tensor
@@ -219,7 +247,9 @@ class Pyramid:
     def of_rows(self, rows: Tensor, n_rows: Tensor) -> Pyramid:
         """This pyramid, made with capacity of ``rows`` of an input, as one of that input.
 
-        n_rows: int64, how many of the input there should have been; more than ``rows`` do not fit.
+        Args:
+            rows: int64, of the input.
+            n_rows: int64, how many of the input there should have been; more than ``rows`` do not fit.
         """
         most = self.found.new_full((), rows.shape[0])
         problems = self.found[0] | torch.where(n_rows > most, PyramidCapacity.TOO_LARGE, 0)
@@ -231,8 +261,10 @@ class Pyramid:
 class PyramidCapacity:
     """How large the results of :func:`build_pyramid` are whatever the data, so that nothing waits for their sizes.
 
-    sizes: rows, clouds, patches and keys of every stage, then the pairs of every kernel map. Stage 0 has room for all
-    input rows.
+    Attributes:
+        n_stages: levels.
+        sizes: rows, clouds, patches and keys of every level, then the pairs of every kernel map. Level 0 has capacity
+            for all input rows.
     """
 
     n_stages: int
@@ -243,7 +275,13 @@ class PyramidCapacity:
 
     @classmethod
     def of(cls, pyramid: Pyramid, n_rows: int, factor: float = 1.25) -> PyramidCapacity:
-        """Room for ``factor`` times what ``pyramid``, made of ``n_rows`` input rows, holds."""
+        """Capacity for a multiple of what a pyramid holds.
+
+        Args:
+            pyramid: of the data.
+            n_rows: input rows it was made of.
+            factor: 1 or more.
+        """
         counts = []
         for stage in pyramid.stages:
             table = stage.patches[0]
@@ -252,7 +290,7 @@ class PyramidCapacity:
         return cls(len(pyramid.stages), (n_rows,) + (0,) * (len(counts) - 1)).grown((0, *counts), factor)
 
     def grown(self, found: Sequence[int], factor: float = 1.25) -> PyramidCapacity:
-        """This capacity, and room for ``factor`` times what was found where that is more.
+        """This capacity, or ``factor`` times what was found where that is more.
 
         Args:
             found: numbers of ``Pyramid.found``.
@@ -373,8 +411,8 @@ def build_pyramid(
     if rounded and not torch.compiler.is_compiling():
         each = len(PyramidCapacity.COUNTS)
         counts = arrays[-1].tolist()[1 : 1 + each * spec.n_stages : each]
-    with Branches(positions, MANY_STREAMS) as beside:
-        return _assemble(arrays, spec, counts, capacity is not None or rounded, beside)
+    with Branches(positions, MANY_STREAMS) as streams:
+        return _assemble(arrays, spec, counts, capacity is not None or rounded, streams)
 
 
 def _check_spec(spec: PyramidSpec, curves: tuple[tuple[int, ...], ...] | None) -> None:
@@ -400,17 +438,17 @@ def _check_whole_numbers(name: str, values: tuple[int, ...]) -> None:
         check_whole("build_pyramid", **{name: value})
 
 
-def _kernel_map(size: int, voxels: Voxels, taps: tuple[Tensor, Tensor, Tensor], beside: Branches) -> KernelMap:
+def _kernel_map(size: int, voxels: Voxels, taps: tuple[Tensor, Tensor, Tensor], streams: Branches) -> KernelMap:
     """Larger kernels have one convolution a network call and tables of K^3 entries a row: no plan is kept."""
     plan = None
     if taps[0].is_cuda and size == 3:
         make = torch.ops.gsim3d.sparse_conv_plan
-        plan = beside.run(make, voxels.row_voxel, voxels.rows, voxels.cu_rows, *taps, size)
+        plan = streams.run(make, voxels.row_voxel, voxels.rows, voxels.cu_rows, *taps, size)
     return KernelMap(size, *taps, plan)
 
 
 def _assemble(
-    arrays: list[Tensor], spec: PyramidSpec, counts: list[int] | None, has_found: bool, beside: Branches
+    arrays: list[Tensor], spec: PyramidSpec, counts: list[int] | None, has_found: bool, streams: Branches
 ) -> Pyramid:
     """Names the flat results, in the order that csrc/gsim3d/curve/pyramid.h states. ``counts``: rows of data of each
     stage, where that is not all and the host knows it."""
@@ -424,7 +462,7 @@ def _assemble(
         grid, cloud, cu_clouds, order, cu_q, cu_k, kv_rows = [take() for _ in range(7)]
         patches = tuple(PatchTable(order[r], kv_rows[r], cu_q, cu_k) for r in range(4))
         voxels = Voxels(take(), take(), take())
-        kernel_maps = {size: _kernel_map(size, voxels, (take(), take(), take()), beside) for size in sizes}
+        kernel_maps = {size: _kernel_map(size, voxels, (take(), take(), take()), streams) for size in sizes}
         n_data = counts[len(stages)] if counts else None if has_found else grid.shape[0]
         stages.append(Stage(grid, cloud, cu_clouds, order, patches, voxels, kernel_maps, cluster, time_index, n_data))
     return Pyramid(rows, cu_rows, tuple(stages), take() if has_found else None)

@@ -39,7 +39,18 @@ def pool_max(x: Tensor, rows: Tensor, cu_rows: Tensor, *, check: bool = True) ->
 
 
 def pool_mean(x: Tensor, rows: Tensor, cu_rows: Tensor, *, check: bool = True) -> Tensor:
-    """Mean over segments of rows; 0 where a segment is empty. Arguments and errors as :func:`pool_max`.
+    """Mean over segments of rows; 0 where a segment is empty.
+
+    Args:
+        x: features [N, C], float32 or float64.
+        rows: int64 [R], as in :func:`pool_max`.
+        cu_rows: int64 [M + 1], as in :func:`pool_max`.
+        check: as in :func:`pool_max`.
+    Returns:
+        [M, C], dtype of ``x``.
+    Gradients: ``x``, once.
+    Raises:
+        NumericalError, ValueError, TypeError: as :func:`pool_max`.
 
     Example:
         >>> pool_mean(torch.tensor([[1.0], [5.0]]), torch.tensor([0, 1]), torch.tensor([0, 2]))

@@ -28,7 +28,7 @@ from gsim3d.dynamics import DynamicsConfig, concatenate
 from gsim3d.effects.plan import Plan
 from gsim3d.errors import CaptureError, InputError
 from gsim3d.io.checkpoint import laid_out_as
-from gsim3d.nn.multiview_encoder import Room
+from gsim3d.nn.multiview_encoder import StaticShapes
 from gsim3d.numerics.report import StabilityReport
 from gsim3d.ops import PyramidCapacity
 from gsim3d.ops.curve import Pyramid
@@ -66,18 +66,18 @@ class Prepared:
         batch: the batch.
         counts: particles of each cloud.
         moving: of one cloud at most, that may move.
-        room: capacity of the encoder for it.
+        shapes: static shapes of the encoder for it.
     """
 
     batch: Batch
     counts: tuple[int, ...]
     moving: int
-    room: Room
+    shapes: StaticShapes
 
     @property
     def kind(self) -> tuple:
         """What batches have in common that one graph serves."""
-        batch, table = self.batch, self.room.clouds
+        batch, table = self.batch, self.shapes.clouds
         images = len(batch.context.cameras), len(batch.targets.cameras)
         return table.scenes, table.steps, batch.n_future, batch.cut, images
 
@@ -192,7 +192,7 @@ class CapturedLoss:
         all_move = context.dynamic is None or self.plan.spec.dynamics.background == "dynamic"
         moving = masks if all_move else masks & context.dynamic
         counts, moving = torch.stack([x.reshape(n_clouds, -1).sum(1) for x in (masks, moving)]).tolist()
-        return Prepared(batch, tuple(counts), max(moving), self.simulator.encoder.room(context, max(counts)))
+        return Prepared(batch, tuple(counts), max(moving), self.simulator.encoder.static_shapes(context, max(counts)))
 
     def __call__(self, prepared: Prepared, weights: Tensor, report: StabilityReport) -> Gradients:
         """Gradients are overwritten by the next call.
@@ -224,7 +224,7 @@ class _Step:
         self._graph = self._records = None
         batch, self._clouds = prepared.batch, prepared.kind[:2]
         self._context, self._targets = _own(batch.context), _own(batch.targets)
-        self._room = owner.simulator.encoder.room(batch.context, particles)
+        self._shapes = owner.simulator.encoder.static_shapes(batch.context, particles)
         self._n_future, self._cut, self._weights = batch.n_future, batch.cut, weights.clone()
 
     def __call__(self, prepared: Prepared, weights: Tensor, report: StabilityReport) -> Gradients:
@@ -259,7 +259,7 @@ class _Step:
     def _encode(self, report: StabilityReport) -> Particles:
         owner = self._owner
         with owner.precision("encoder"):
-            encode = partial(owner.simulator.encode, room=self._room, report=report)
+            encode = partial(owner.simulator.encode, shapes=self._shapes, report=report)
             return owner.again("encoder")(encode)(self._context)
 
     def _rollout(
@@ -366,7 +366,7 @@ class _Step:
     @torch.no_grad()
     def _load(self, prepared: Prepared, weights: Tensor) -> None:
         """Copies a batch to where the graph reads it."""
-        self._room.copy_(prepared.room)
+        self._shapes.copy_(prepared.shapes)
         self._weights.copy_(weights)
         batch = prepared.batch
         for own, given in ((self._context, batch.context), (self._targets, batch.targets)):

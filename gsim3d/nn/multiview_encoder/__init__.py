@@ -2,6 +2,6 @@
 
 from gsim3d.nn.multiview_encoder.config import EncoderConfig
 from gsim3d.nn.multiview_encoder.encoder import Encoder, pixel_rows
-from gsim3d.nn.multiview_encoder.room import Room
+from gsim3d.nn.multiview_encoder.static_shapes import StaticShapes
 
-__all__ = ["Encoder", "EncoderConfig", "Room", "pixel_rows"]
+__all__ = ["Encoder", "EncoderConfig", "StaticShapes", "pixel_rows"]

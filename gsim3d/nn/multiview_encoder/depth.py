@@ -17,7 +17,7 @@ from gsim3d.nn.multiview_encoder.layout import GroupNorm, by_pixel, for_convolut
 from gsim3d.nn.multiview_encoder.unet import UNet, repeat_pixels
 
 if TYPE_CHECKING:
-    from gsim3d.nn.multiview_encoder.room import ViewGeometry
+    from gsim3d.nn.multiview_encoder.static_shapes import ViewGeometry
 
 INITIAL_OPACITY = 0.5  # of an untrained encoder: views of the same surface blend, and gradients reach what lies behind
 INITIAL_OUTPUT = 0.01  # scale of the untrained disparity correction and opacity logit

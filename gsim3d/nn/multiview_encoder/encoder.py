@@ -16,17 +16,16 @@ from gsim3d.nn.multiview_encoder.cnn import CNN
 from gsim3d.nn.multiview_encoder.config import EncoderConfig
 from gsim3d.nn.multiview_encoder.depth import DepthPredictor, Views
 from gsim3d.nn.multiview_encoder.heads import ParticleHeads, PixelParticles, PixelRays
-from gsim3d.nn.multiview_encoder.room import Places, Room, ViewGeometry
+from gsim3d.nn.multiview_encoder.static_shapes import PixelIndex, StaticShapes, ViewGeometry
 from gsim3d.nn.multiview_encoder.transformer import MultiViewTransformer
 from gsim3d.state import ASLEEP, DYNAMIC, FROZEN, CloudTable, Particles
 
 
-def pixel_rows(frames: Frames, values: Tensor, room: Room | None = None) -> Tensor:
-    """``values`` [I, H, W] of the pixels that become particles, in the order of their rows; 0 in rows of ``room`` that
-    have none."""
-    if room is not None:
-        places = Places.of(frames, room)
-        return torch.where(places.is_one, values.flatten()[places.pixel], 0)
+def pixel_rows(frames: Frames, values: Tensor, shapes: StaticShapes | None = None) -> Tensor:
+    """``values`` [I, H, W] of the pixels that become particles, in their order; 0 in the padding of ``shapes``."""
+    if shapes is not None:
+        index = PixelIndex.of(frames, shapes)
+        return torch.where(index.exists, values.flatten()[index.pixel], 0)
     order = torch.argsort(frames.cameras.image_cloud, stable=True)
     flat = values[order].flatten()
     return flat if frames.masks is None else flat[frames.masks[order].flatten()]
@@ -54,17 +53,17 @@ class Encoder(nn.Module):
         self.to(memory_format=torch.channels_last)  # convolutions with few channels are faster on it, on CPU and GPU
 
     def check(self, frames: Frames, *, pixels: bool = True) -> None:
-        """Raises as :meth:`forward` does for ``frames``; ``pixels``: the values of images are looked at, too."""
+        """Raises as :meth:`forward` does for ``frames``; ``pixels``: also for the values of images."""
         check_frames(frames, self.config, next(self.parameters()).dtype, pixels=pixels)
 
-    def forward(self, frames: Frames, room: Room | None = None, *, check: bool = True) -> Particles:
-        """Particles of every cloud: its images in ascending order, pixels row by row, those outside ``masks`` left out.
+    def forward(self, frames: Frames, shapes: StaticShapes | None = None, *, check: bool = True) -> Particles:
+        """Particles of every cloud: images in ascending order, pixels line by line, inside ``masks``.
 
         On a GPU it computes in float32 unless autocast, or torch's switch for TF32 in matrix products, says otherwise.
 
         Args:
-            room: of :meth:`room`, for frames like these in all but their numbers. Nothing then waits for the device,
-                and nothing is checked; particles that have no row are left out.
+            shapes: of :meth:`static_shapes`, for frames that differ from these in their numbers only. Nothing then
+                waits for the device, and nothing is checked; pixels beyond the capacity are left out.
             check: look for what cannot be used; a caller that has done so leaves it out.
         Gradients: ``frames.images`` and the parameters; of convolutions as torch's own switch for them says.
         Raises:
@@ -72,17 +71,17 @@ class Encoder(nn.Module):
             NumericalError: an image, camera or origin is not finite or out of range; the message names scene, step and
                 tensor.
         """
-        if room is not None:
+        if shapes is not None:
             with tf32_only_if_asked():
-                return self._encode_into(frames, room)
+                return self._encode_into(frames, shapes)
         if check:
             self.check(frames)
         with tf32_only_if_asked():
             return self._encode(frames)
 
     @torch.no_grad()
-    def room(self, frames: Frames, size: int) -> Room:
-        """Room for ``size`` rows a cloud. It is made of the cameras; images and masks may then be others.
+    def static_shapes(self, frames: Frames, size: int) -> StaticShapes:
+        """Static shapes for ``size`` particles a cloud, made of the cameras; images and masks may then be others.
 
         Raises:
             InputError, NumericalError: as :meth:`forward`; or clouds have different numbers of views.
@@ -92,27 +91,27 @@ class Encoder(nn.Module):
         n_views = len(cameras) // n_clouds
         ordered = torch.arange(n_clouds, device=cameras.image_cloud.device).repeat_interleave(n_views)
         if not torch.equal(ordered, cameras.image_cloud):
-            raise InputError("Encoder.room: cameras.image_cloud must ascend, with as many views for each cloud")
+            raise InputError("Encoder.static_shapes: cameras.image_cloud must ascend, as many views in each cloud")
         views = _views(frames, n_views)
         geometry = ViewGeometry(PixelRays.of(views), *self.depth.cost_volume.sweep_geometry(views))
         scenes, steps = torch.stack([frames.cloud_scene, frames.cloud_step]).tolist()
-        return Room(CloudTable.make([size] * n_clouds, scenes, steps, frames.images.device), geometry)
+        return StaticShapes(CloudTable.make([size] * n_clouds, scenes, steps, frames.images.device), geometry)
 
-    def _encode_into(self, frames: Frames, room: Room) -> Particles:
-        n_views, places = len(frames.cameras) // len(room.clouds), Places.of(frames, room)
-        part = self._predict(_views(frames, n_views, room.geometry), frames.origin[_scene_of_image(frames)])
-        (cu_rows, cloud_scene, cloud_step), known = room.clouds.tensors, room.clouds
+    def _encode_into(self, frames: Frames, shapes: StaticShapes) -> Particles:
+        n_views, index = len(frames.cameras) // len(shapes.clouds), PixelIndex.of(frames, shapes)
+        part = self._predict(_views(frames, n_views, shapes.geometry), frames.origin[_scene_of_image(frames)])
+        (cu_rows, cloud_scene, cloud_step), known = shapes.clouds.tensors, shapes.clouds
         fields = {}
         for name in PixelParticles.__dataclass_fields__:
             values = getattr(part, name)
             if values is not None:
-                values = _Kept.apply(values.flatten(0, 1), places.pixel, places.row)
+                values = _Kept.apply(values.flatten(0, 1), index.pixel, index.particle)
                 nothing = torch.eye(1, 4, dtype=values.dtype, device=values.device) if name == "quats" else 0
-                fields[name] = torch.where(places.is_one.reshape(-1, *[1] * (values.dim() - 1)), values, nothing)
-        activity = torch.full_like(places.pixel, DYNAMIC, dtype=torch.uint8)
+                fields[name] = torch.where(index.exists.reshape(-1, *[1] * (values.dim() - 1)), values, nothing)
+        activity = torch.full_like(index.pixel, DYNAMIC, dtype=torch.uint8)
         if frames.dynamic is not None:
-            activity.masked_fill_(~frames.dynamic.flatten()[places.pixel], FROZEN)
-        activity.masked_fill_(~places.is_one, ASLEEP)
+            activity.masked_fill_(~frames.dynamic.flatten()[index.pixel], FROZEN)
+        activity.masked_fill_(~index.exists, ASLEEP)
         return Particles(
             **fields,
             cu_rows=cu_rows,

@@ -8,10 +8,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from gsim3d.math.rotations import unit_quats
+from gsim3d.math.rotations import quat_product, rotation_to_quat, unit_quats, with_positive_largest
 from gsim3d.math.spherical_harmonics import degree_damping, rotate_harmonics
 from gsim3d.nn.layers import widened
-from gsim3d.nn.multiview_encoder import camera_frame
 from gsim3d.nn.multiview_encoder.config import EncoderConfig
 from gsim3d.nn.multiview_encoder.depth import Depth, Views
 from gsim3d.nn.multiview_encoder.layout import for_convolution
@@ -135,9 +134,9 @@ class ParticleHeads(nn.Module):
         pixel_size = geometry.inverse_Ks[:, :2, :2].sum((1, 2)).to(raw.dtype)[:, None, None]
         scales = (smallest + (largest - smallest) * raw_scales.sigmoid()) * (_rows(depth) * 0.1 * pixel_size)
         rotations = geometry.rotations.to(raw.dtype)
-        turn = camera_frame.rotation_to_quat(rotations)[:, None]
-        quats = camera_frame.quat_multiply(turn, unit_quats(raw_quats.roll(1, -1)))  # raw: real part last
-        quats = camera_frame.with_positive_largest(quats)  # as those that the dynamics writes and reads
+        turn = rotation_to_quat(rotations)[:, None]
+        quats = quat_product(turn, unit_quats(raw_quats.roll(1, -1)))  # raw: real part last
+        quats = with_positive_largest(quats)  # as those that the dynamics writes and reads
         damping = degree_damping(self.config.sh_degree, raw)
         in_camera = raw_sh.reshape(n_images, -1, 3, damping.shape[0]) * damping
         each = torch.eye(len(damping), dtype=geometry.rotations.dtype, device=raw.device).repeat(n_images, 1, 1)

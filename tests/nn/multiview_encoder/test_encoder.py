@@ -11,10 +11,9 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from gsim3d.cameras import Frames
 from gsim3d.compat.released_model import as_released
 from gsim3d.errors import InputError, NumericalError
-from gsim3d.math.rotations import rotation_matrices, unit_quats
+from gsim3d.math.rotations import quat_product, rotation_matrices, rotation_to_quat, unit_quats
 from gsim3d.math.spherical_harmonics import rotate_harmonics
 from gsim3d.nn.multiview_encoder import Encoder, EncoderConfig, pixel_rows
-from gsim3d.nn.multiview_encoder.camera_frame import quat_multiply, rotation_to_quat
 from gsim3d.nn.multiview_encoder.depth import CostVolume, DepthPredictor, Views, upsampling_matrix
 from gsim3d.nn.multiview_encoder.heads import ParticleHeads, PixelRays
 from gsim3d.state import ASLEEP, DYNAMIC, FROZEN
@@ -291,7 +290,7 @@ def test_quaternions_of_rotations():
     x = torch.randn(3, dtype=torch.float64)
     pure = torch.cat([x.new_zeros(1), x]).expand(len(q), 4)
     conjugate = q * torch.tensor([1.0, -1, -1, -1], dtype=torch.float64)
-    assert torch.allclose(quat_multiply(quat_multiply(q, pure), conjugate)[:, 1:], R @ x)
+    assert torch.allclose(quat_product(quat_product(q, pure), conjugate)[:, 1:], R @ x)
 
 
 def test_explicit_quaternions_are_those_that_a_matrix_gives():
@@ -378,16 +377,16 @@ def test_config_errors(changes, message):
 
 
 def test_particles_in_given_room_are_those_of_their_clouds():
-    """Other images and cameras than those that the room was made of; two clouds of two views."""
+    """Other images and cameras than those that the shapes was made of; two clouds of two views."""
     encoder, frames = make_encoder(), make_frames([0, 0, 1, 1])
     chance = torch.rand(frames.images[:, :2].shape, generator=torch.Generator().manual_seed(3))
     share = torch.tensor([0.3, 0.3, 0.5, 0.5])[:, None, None]
     frames = dataclasses.replace(frames, masks=chance[:, 0] < share, dynamic=chance[:, 1] < 0.5)
-    room = encoder.room(make_frames([0, 0, 1, 1], seed=5), 300)
+    shapes = encoder.static_shapes(make_frames([0, 0, 1, 1], seed=5), 300)
     cameras = dataclasses.replace(frames.cameras, near=frames.cameras.near * 1.1)
     frames = dataclasses.replace(frames, cameras=cameras)
-    room.copy_(encoder.room(frames, 300))
-    whole, placed = encoder(frames), encoder(frames, room)
+    shapes.copy_(encoder.static_shapes(frames, 300))
+    whole, placed = encoder(frames), encoder(frames, shapes)
     counts = whole.cu_rows.diff().tolist()
     assert placed.clouds.starts == (0, 300, 600) and 0 < min(counts) < max(counts) < 300
     rows = torch.cat([torch.arange(counts[0]), 300 + torch.arange(counts[1])])
@@ -395,7 +394,7 @@ def test_particles_in_given_room_are_those_of_their_clouds():
     for name in (*ROW_FIELDS, "activity"):
         assert torch.equal(getattr(placed, name)[rows], getattr(whole, name)), name
     assert placed.activity[others].eq(ASLEEP).all() and placed.opacities[others].eq(0).all()
-    assert torch.equal(pixel_rows(frames, frames.dynamic, room)[rows], pixel_rows(frames, frames.dynamic))
+    assert torch.equal(pixel_rows(frames, frames.dynamic, shapes)[rows], pixel_rows(frames, frames.dynamic))
     weight = torch.randn(whole.means.shape, generator=torch.Generator().manual_seed(4))
     parameters = list(encoder.parameters())
     expected = torch.autograd.grad((whole.means * weight).sum(), parameters, allow_unused=True)
@@ -403,14 +402,14 @@ def test_particles_in_given_room_are_those_of_their_clouds():
     for a, b in zip(actual, expected, strict=True):
         assert (a is None) == (b is None)
         assert a is None or torch.equal(a, b)
-    few = encoder(frames, encoder.room(frames, 100))  # what has no room is left out
+    few = encoder(frames, encoder.static_shapes(frames, 100))  # what has no room is left out
     assert torch.equal(few.means[:100], whole.means[:100]) and few.activity.ne(ASLEEP).all()
 
 
 def test_room_is_for_clouds_of_equal_views_in_order():
     for clouds in ([0, 0, 1], [1, 0]):
         with pytest.raises(InputError, match="image_cloud"):
-            make_encoder().room(make_frames(clouds), 100)
+            make_encoder().static_shapes(make_frames(clouds), 100)
 
 
 class Calls(TorchDispatchMode):
@@ -430,8 +429,8 @@ def test_nothing_waits_for_the_device_in_given_room(explicit):
     """Nor is anything sent there: operators that read numbers or make tensors of them are not called."""
     encoder, frames = make_encoder(explicit=explicit), make_frames([0, 0, 1, 1])
     frames = dataclasses.replace(frames, masks=frames.images[:, 0] < 0.4, dynamic=frames.images[:, 1] < 0.5)
-    room = encoder.room(frames, 250)
-    encoder(frames, room)  # makes constants
+    shapes = encoder.static_shapes(frames, 250)
+    encoder(frames, shapes)  # makes constants
     waiting = {"_local_scalar_dense", "item", "equal", "nonzero", "_unique2", "masked_select", "lift_fresh"}
     waiting |= {"linalg_inv_ex", "_linalg_check_errors", "is_nonzero", "repeat_interleave"}
     waiting -= {"lift_fresh"} if explicit else set()  # a number written into a slice, which a GPU fills
@@ -443,5 +442,5 @@ def test_nothing_waits_for_the_device_in_given_room(explicit):
             torch.autograd.grad(loss, list(encoder.parameters()), allow_unused=True)
         return calls.names & waiting
 
-    assert not names(room)
+    assert not names(shapes)
     assert {"_local_scalar_dense", "nonzero", "linalg_inv_ex"} <= names()
