@@ -22,7 +22,7 @@ def data(tmp_path):
     return tmp_path / "data"
 
 
-def test_sound_data(data, capsys):
+def test_check_data_accepts_sound_scenes(data, capsys):
     out = data.parent / "sheet.png"
     assert main(["check-data", str(data), "--out", str(out)]) == 0
     printed = capsys.readouterr().out
@@ -32,7 +32,7 @@ def test_sound_data(data, capsys):
     assert [path.name for path in data.parent.iterdir() if path != data] == ["sheet.png"]
 
 
-def test_every_problem_of_every_scene(data, capsys):
+def test_check_data_lists_every_problem_of_every_scene(data, capsys):
     (data / "genesis/cam_0/rgb_0001.png").unlink()
     (data / "genesis/cam_2/rgb_0003.png").write_bytes(b"x")
     edit_json(data / "kubric/cam_1/metadata.json", lambda content: content["camera"]["positions"].pop())
@@ -51,14 +51,14 @@ def test_every_problem_of_every_scene(data, capsys):
     assert out.is_file()
 
 
-def test_nothing_is_written_without_being_asked(data, capsys, monkeypatch):
+def test_check_data_writes_nothing_without_out(data, capsys, monkeypatch):
     monkeypatch.chdir(data.parent)
     assert main(["check-data", "data"]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == "3 scenes read, no problem; --out draws a picture of the cameras"
     assert [path.name for path in data.parent.iterdir()] == ["data"]
 
 
-def test_quiet_prints_problems_only(data, capsys):
+def test_check_data_quiet_prints_problems_only(data, capsys):
     (data / "videos/cameras.json").write_text("{")
     assert main(["check-data", str(data), "--quiet"]) == 1
     printed = capsys.readouterr()
@@ -68,7 +68,7 @@ def test_quiet_prints_problems_only(data, capsys):
     assert printed.err == ""
 
 
-def test_nothing_to_draw(tmp_path, capsys):
+def test_check_data_without_readable_scene_draws_nothing(tmp_path, capsys):
     (tmp_path / "cameras.json").write_text("[]")
     assert main(["check-data", str(tmp_path), "--out", str(tmp_path / "sheet.png")]) == 1
     assert "no scene could be drawn" in capsys.readouterr().out and not (tmp_path / "sheet.png").exists()
@@ -77,7 +77,7 @@ def test_nothing_to_draw(tmp_path, capsys):
 @pytest.mark.parametrize(
     "arguments", [["{data}/absent"], ["{empty}"], ["{data}", "--out", "a.jpg"], ["{data}", "--out", "{file}/no/a.png"]]
 )
-def test_the_check_cannot_run(data, tmp_path, capsys, arguments):
+def test_check_data_exit_code_where_it_cannot_run(data, tmp_path, capsys, arguments):
     (tmp_path / "empty").mkdir()
     places = {"data": data, "empty": tmp_path / "empty", "file": data / "genesis" / "metadata.json"}
     words = [word.format(**places) for word in arguments]
@@ -85,7 +85,7 @@ def test_the_check_cannot_run(data, tmp_path, capsys, arguments):
     assert capsys.readouterr().err.startswith("gsim3d: error: ")
 
 
-def test_the_sheet_draws_the_bounds_where_they_project(tmp_path):
+def test_contact_sheet_draws_bounds_at_their_projection(tmp_path):
     """On black frames only the drawing is left: corners of the bounds are where a plain projection puts them."""
     made = make_scene()
     made.rgb[:], made.labels[:] = 0, 0
@@ -106,7 +106,7 @@ def test_the_sheet_draws_the_bounds_where_they_project(tmp_path):
     assert drawn >= 6
 
 
-def test_moving_bodies_are_found_where_they_are(tmp_path):
+def test_moving_box_encloses_the_ball(tmp_path):
     made = make_scene()
     scene = Scene.open(write_genesis(tmp_path, made))
     for step in range(4):
@@ -116,7 +116,7 @@ def test_moving_bodies_are_found_where_they_are(tmp_path):
         assert (box[1] - box[0] > 1.5 * RADIUS).all() and (box[1] - box[0] < 6 * RADIUS).all()
 
 
-def test_masks_of_other_places_have_nothing_in_common(tmp_path):
+def test_check_scene_reports_masks_without_common_position(tmp_path):
     made = make_scene()
     made.labels[:, 1:] = 0
     made.labels[:, 1, :4, :4], made.labels[:, 2, -4:, -4:] = 3, 3
@@ -124,7 +124,7 @@ def test_masks_of_other_places_have_nothing_in_common(tmp_path):
     assert "no common position" in problem and "metadata.json" in problem
 
 
-def test_unreadable_frames_do_not_stop_the_sheet(tmp_path):
+def test_contact_sheet_with_unreadable_frames(tmp_path):
     folder = write_genesis(tmp_path, make_scene())
     for file in folder.rglob("rgb_*.png"):
         file.unlink()
@@ -133,7 +133,7 @@ def test_unreadable_frames_do_not_stop_the_sheet(tmp_path):
     assert cv2.imwrite(str(tmp_path / "sheet.png"), sheet)
 
 
-def test_names_that_are_not_utf8_are_drawn_and_printed_with_escapes(tmp_path, capsys):
+def test_check_data_escapes_names_that_are_not_utf8(tmp_path, capsys):
     """OpenCV ends the process at letters that no encoding has."""
     folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/sc\xff\x1bne"))
     write_scene(tmp_path / "scene", n_steps=2).rename(folder)

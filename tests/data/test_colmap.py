@@ -68,7 +68,7 @@ def seen_points(count=200):
 
 @pytest.mark.parametrize("binary", [True, False])
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])
-def test_every_image_is_a_camera_of_one_instant(tmp_path, binary, place):
+def test_colmap_images_are_cameras_of_one_step(tmp_path, binary, place):
     made = make_scene(n_steps=1, n_cams=4)
     folder = write_colmap(tmp_path / "scene", made, binary=binary, place=place, points=seen_points())
     scene = Scene.open(folder)
@@ -82,7 +82,7 @@ def test_every_image_is_a_camera_of_one_instant(tmp_path, binary, place):
 
 
 @pytest.mark.parametrize("binary", [True, False])
-def test_near_and_far_are_those_of_the_points(tmp_path, binary):
+def test_colmap_near_and_far_follow_from_points(tmp_path, binary):
     made, points = make_scene(n_steps=1), seen_points()
     local = points @ made.viewmats[0, :, :3, :3].swapaxes(1, 2) + made.viewmats[0, :, None, :3, 3]
     depths = local[..., 2]
@@ -99,7 +99,7 @@ def test_near_and_far_are_those_of_the_points(tmp_path, binary):
 
 @pytest.mark.parametrize("binary", [True, False])
 @pytest.mark.parametrize("stride", [1, 2])
-def test_names_are_cameras_and_times_where_there_is_a_rate(tmp_path, binary, stride):
+def test_colmap_names_give_cameras_and_times_with_fps(tmp_path, binary, stride):
     made = make_scene(moving=True)
     names = lambda step, cam: f"cam{cam}/{stride * step + 1:04d}.png"  # noqa: E731
     folder = write_colmap(tmp_path, made, binary=binary, names=names)
@@ -127,7 +127,7 @@ LENSES = {
 
 @pytest.mark.parametrize("model", LENSES)
 @pytest.mark.parametrize("binary", [True, False])
-def test_models_of_cameras(tmp_path, model, binary):
+def test_colmap_camera_models_are_read(tmp_path, model, binary):
     params, wanted = LENSES[model]
     scene = Scene.open(write_colmap(tmp_path, make_scene(n_steps=1), binary=binary, model=model, params=params))
     lens = scene.recording.distortions[0]
@@ -140,20 +140,20 @@ def test_models_of_cameras(tmp_path, model, binary):
 
 @pytest.mark.parametrize("model", ["FOV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"])
 @pytest.mark.parametrize("binary", [True, False])
-def test_other_models_are_refused_by_name(tmp_path, model, binary):
+def test_colmap_unread_camera_models_are_refused_by_name(tmp_path, model, binary):
     write_colmap(tmp_path, make_scene(n_steps=1), binary=binary, model=model, params=[50, 50, 24, 16, 0.9])
     with pytest.raises(InputError, match=f"camera 10: the model {model} is not read"):
         Scene.open(tmp_path)
 
 
-def test_images_of_a_lens_are_undistorted(tmp_path):
+def test_colmap_images_are_undistorted(tmp_path):
     made = make_scene(n_steps=1)
     scene = Scene.open(write_colmap(tmp_path, made, model="OPENCV_FISHEYE", params=[50, 51, 24, 16, 0.1, 0, 0, 0]))
     assert scene.valid(range(3), [0]) is not None
     assert not np.array_equal(scene.recorded_images(range(3), [0])[0].permute(0, 2, 3, 1), made.rgb[0])
 
 
-def test_alpha_is_the_mask(tmp_path):
+def test_colmap_alpha_is_the_mask(tmp_path):
     made = make_scene(n_steps=1)
     write_colmap(tmp_path, made, names=lambda step, cam: f"{cam}.png")
     for cam in range(3):
@@ -163,14 +163,14 @@ def test_alpha_is_the_mask(tmp_path):
     np.testing.assert_array_equal(labels, np.where(made.labels[0] == 3, 3, 0))
 
 
-def test_other_models_beside_the_first_are_named(tmp_path):
+def test_colmap_notes_name_other_models(tmp_path):
     folder = write_colmap(tmp_path, make_scene(n_steps=1))
     shutil.copytree(folder / "sparse/0", folder / "sparse/1")
     assert "1 other models beside it are not" in describe(Scene.open(folder))
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
-def test_binary_files_that_are_cut_off(tmp_path, name):
+def test_colmap_truncated_binary_files_are_refused(tmp_path, name):
     folder = write_colmap(tmp_path, make_scene(n_steps=1), points=seen_points(9))
     file = folder / "sparse/0" / name
     data = file.read_bytes()
@@ -197,7 +197,7 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("kind", DAMAGE)
-def test_text_that_is_damaged(tmp_path, kind):
+def test_colmap_damaged_text_is_refused(tmp_path, kind):
     name, old, new, message = DAMAGE[kind]
     file = write_colmap(tmp_path, make_scene(n_steps=1), binary=False) / "sparse/0" / name
     text = file.read_text()
@@ -208,7 +208,7 @@ def test_text_that_is_damaged(tmp_path, kind):
     assert check_scene(tmp_path).problems
 
 
-def test_models_of_any_number_of_images_are_refused(tmp_path, monkeypatch):
+def test_colmap_number_of_images_is_bounded(tmp_path, monkeypatch):
     monkeypatch.setattr(colmap, "MAX_ENTRIES", 3)
     folder = write_colmap(tmp_path, make_scene(n_steps=1))
     assert Scene.open(folder).n_cams == 3
@@ -217,7 +217,7 @@ def test_models_of_any_number_of_images_are_refused(tmp_path, monkeypatch):
         Scene.open(folder)
 
 
-def test_a_quaternion_has_length_one(tmp_path):
+def test_colmap_quaternions_must_be_unit(tmp_path):
     made = make_scene(n_steps=1)
     folder = write_colmap(tmp_path, made, binary=False)
     text = (folder / "sparse/0/images.txt").read_text().splitlines()
@@ -228,14 +228,14 @@ def test_a_quaternion_has_length_one(tmp_path):
         Scene.open(folder)
 
 
-def test_names_without_number_have_no_time(tmp_path):
+def test_colmap_names_without_number_are_refused_with_fps(tmp_path):
     folder = write_colmap(tmp_path, make_scene(n_steps=1), names=lambda step, cam: f"{'abc'[cam]}.png")
     (folder / "scene.json").write_text('{"fps": 30}')
     with pytest.raises(InputError, match="has no number, which is its time"):
         Scene.open(folder)
 
 
-def test_an_image_that_is_missing_is_named(tmp_path):
+def test_colmap_missing_image_is_named(tmp_path):
     folder = write_colmap(tmp_path, make_scene(n_steps=1))
     (folder / "images" / "view 11.png").unlink()
     with pytest.raises(InputError, match="view 11.png .* is missing"):

@@ -92,7 +92,7 @@ def flipped(layout):
 
 
 @pytest.mark.parametrize("layout", STORED_MATRICES)
-def test_flipped_axes_of_all_cameras(copy, layout):
+def test_check_directions_names_flipped_axes_of_all_cameras(copy, layout):
     folder = copy(layout)
     edit_poses(layout, folder, flipped(layout))
     message = message_of(folder)
@@ -100,7 +100,7 @@ def test_flipped_axes_of_all_cameras(copy, layout):
 
 
 @pytest.mark.parametrize("layout", STORED_MATRICES)
-def test_flipped_axes_of_one_camera_at_one_step(copy, layout):
+def test_check_directions_names_one_flipped_camera_and_step(copy, layout):
     folder = copy(layout)
     edit_poses(layout, folder, flipped(layout), cams=[1], steps=[2])
     message = message_of(folder)
@@ -108,7 +108,7 @@ def test_flipped_axes_of_one_camera_at_one_step(copy, layout):
     assert "cam_1" in message
 
 
-def test_flipped_axes_of_kubric(copy):
+def test_check_directions_names_flipped_axes_of_kubric(copy):
     """Axes that are OpenCV's already: the quaternion turned by half a turn around x."""
     folder = copy("kubric")
 
@@ -121,7 +121,7 @@ def test_flipped_axes_of_kubric(copy):
 
 
 @pytest.mark.parametrize("layout", STORED_MATRICES)
-def test_the_other_direction_of_the_matrices(copy, layout):
+def test_check_directions_names_inverted_matrices(copy, layout):
     folder = copy(layout)
     edit_poses(layout, folder, np.linalg.inv)
     message = message_of(folder)
@@ -138,7 +138,7 @@ MATRICES = {
 
 @pytest.mark.parametrize("what", MATRICES)
 @pytest.mark.parametrize("layout", STORED_MATRICES)
-def test_matrices_that_are_no_rigid_motion(copy, layout, what):
+def test_check_pose_refuses_what_is_not_rigid(copy, layout, what):
     factor, expected = MATRICES[what]
     folder = copy(layout)
     edit_poses(layout, folder, lambda m: factor @ m, cams=[2], steps=[3])
@@ -189,7 +189,7 @@ def edit_intrinsics(layout, folder, step, **values):
         ({"fx": float("nan")}, "not finite"),
     ],
 )
-def test_intrinsics(copy, layout, values, expected):
+def test_check_intrinsics_refuses_unusable_values(copy, layout, values, expected):
     folder = copy(layout)
     edit_intrinsics(layout, folder, 2, **values)
     message = message_of(folder)
@@ -209,7 +209,7 @@ NUMBER = {"genesis": 2, "kubric": 2, "transforms": 2, "videos": 4}
 @pytest.mark.parametrize("layout", FILES)
 @pytest.mark.parametrize("kind", [0, 1], ids=["image", "mask"])
 @pytest.mark.parametrize("damage", ["missing", "truncated", "empty", "other size", "no image"])
-def test_files(copy, layout, kind, damage):
+def test_missing_and_broken_files_are_named(copy, layout, kind, damage):
     folder = copy(layout)
     file = folder / FRAMES[layout][kind]
     data = file.read_bytes()
@@ -228,7 +228,7 @@ def test_files(copy, layout, kind, damage):
         assert expected in message and str(file) in message
 
 
-def test_a_camera_with_fewer_frames(copy):
+def test_camera_with_fewer_frames_is_named(copy):
     for layout, last in (("kubric", "cam_2/rgba/rgba_3.png"), ("videos", "cam_2/006.png")):
         folder = copy(layout)
         (folder / last).unlink()
@@ -245,7 +245,7 @@ def test_a_camera_with_fewer_frames(copy):
     assert "camera images/cam_2/frame has 3 frames" in message and "4 times" in message and "transforms.json" in message
 
 
-def test_a_frame_that_no_camera_has(copy):
+def test_unevenly_numbered_frames_are_refused(copy):
     folder = copy("videos")
     for cam in range(3):
         (folder / f"cam_{cam}" / "002.png").unlink()
@@ -268,7 +268,7 @@ OUTSIDE = {
 
 
 @pytest.mark.parametrize("layout", OUTSIDE)
-def test_paths_stay_inside(copy, layout):
+def test_paths_out_of_the_scene_are_refused(copy, layout):
     folder = copy(layout)
     edit_json(folder / FILES[layout], OUTSIDE[layout])
     message = message_of(folder)
@@ -276,7 +276,7 @@ def test_paths_stay_inside(copy, layout):
 
 
 @pytest.mark.parametrize("layout", FILES)
-def test_links_stay_inside(copy, tmp_path, layout):
+def test_links_out_of_the_scene_are_refused(copy, tmp_path, layout):
     folder = copy(layout)
     file = folder / FRAMES[layout][0]
     file.rename(tmp_path / "elsewhere.png")
@@ -284,7 +284,7 @@ def test_links_stay_inside(copy, tmp_path, layout):
     assert "out of the scene" in message_of(folder)
 
 
-def test_a_camera_that_sees_nothing_of_the_bounds(copy):
+def test_camera_that_sees_nothing_of_the_bounds_is_named(copy):
     folder = copy("genesis")
     edit_json(folder / "metadata.json", lambda content: content.update(bounds=[[20, 20, 0], [21, 21, 1]]))
     assert "cam_0 sees nothing of the bounds" in message_of(folder)
@@ -293,7 +293,7 @@ def test_a_camera_that_sees_nothing_of_the_bounds(copy):
 
 
 @pytest.mark.parametrize("layout", FILES)
-def test_an_origin_that_is_far_from_all_cameras(copy, layout):
+def test_distant_origin_is_refused(copy, layout):
     folder = copy(layout)
     for key, value in (("origin", [1e9, 0, 0]), ("origin", [0, 0, -5001]), ("bounds", [[-1e9] * 3, [1e9] * 3])):
         for file in folder.rglob(FILES[layout]):
@@ -302,7 +302,7 @@ def test_an_origin_that_is_far_from_all_cameras(copy, layout):
         assert f"{key} lies" in message_of(folder)
 
 
-def test_near_and_far_follow_from_the_cameras_or_are_asked_for(copy):
+def test_default_near_and_far_follow_from_cameras(copy):
     folder = copy("videos")
     edit_json(folder / "cameras.json", lambda content: [content.pop("near"), content.pop("far")])
     scene = Scene.open(folder)
@@ -316,7 +316,7 @@ def test_near_and_far_follow_from_the_cameras_or_are_asked_for(copy):
     assert "near and far" in message_of(folder)
 
 
-def test_all_problems_of_a_scene_are_reported(copy):
+def test_check_scene_collects_all_problems(copy):
     folder = copy("genesis")
     (folder / "cam_0/rgb_0001.png").unlink()
     (folder / "cam_2/seg_0003.png").write_bytes(b"")
@@ -333,13 +333,13 @@ def test_all_problems_of_a_scene_are_reported(copy):
         assert any(all(word in problem for word in words) for problem in problems), words
 
 
-def test_a_sound_scene_has_no_problem(folders):
+def test_check_scene_of_sound_scenes_is_empty(folders):
     for layout in FILES:
         check = check_scene(folders / layout)
         assert check.problems == () and check.scene.layout == layout
 
 
-def test_masks_without_a_moving_body(copy):
+def test_check_scene_reports_masks_without_moving_body(copy):
     folder = copy("genesis")
     for file in folder.rglob("seg_*.png"):
         cv2.imwrite(str(file), np.minimum(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), 1))
@@ -349,7 +349,7 @@ def test_masks_without_a_moving_body(copy):
 
 @pytest.mark.parametrize("text", ["", "{", "[1]", "\0", '{"cameras": 3}', '{"frames": [1]}', "{}"])
 @pytest.mark.parametrize("name", ["transforms.json", "cameras.json", "cam_0/metadata.json"])
-def test_descriptions_that_cannot_be_read(tmp_path, name, text):
+def test_unreadable_descriptions_are_refused(tmp_path, name, text):
     (tmp_path / name).parent.mkdir(exist_ok=True)
     (tmp_path / name).write_text(text)
     with pytest.raises(InputError):
@@ -357,7 +357,7 @@ def test_descriptions_that_cannot_be_read(tmp_path, name, text):
     assert check_scene(tmp_path).scene is None and len(check_scene(tmp_path).problems) >= 1
 
 
-def test_sizes_are_checked_before_memory_is_taken(tmp_path):
+def test_image_sizes_are_checked_before_allocation(tmp_path):
     """A PNG whose header tells of 60000 x 60000 pixels is refused by its header."""
     import struct
     import zlib

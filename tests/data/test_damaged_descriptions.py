@@ -81,7 +81,7 @@ def damaged(content, rng):
 
 
 @pytest.mark.parametrize("layout", FILES)
-def test_damaged_descriptions(folders, layout):
+def test_damaged_descriptions_give_typed_errors(folders, layout):
     file = folders[layout] / FILES[layout]
     sound, rng, refused = json.loads(file.read_text()), np.random.default_rng(0), 0
     try:

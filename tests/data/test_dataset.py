@@ -19,14 +19,14 @@ def scenes(tmp_path):
 
 
 @pytest.mark.parametrize("n, n_test", [(1, 0), (2, 1), (14, 1), (15, 1), (34, 4), (100, 12), (1200, 144)])
-def test_split_takes_every_kth_scene(n, n_test):
+def test_split_scenes_takes_every_kth_scene(n, n_test):
     train, test = split_scenes(list(range(n)))
     assert len(test) == n_test and sorted(train + test) == list(range(n))
     if n_test:
         assert test == list(range(0, n_test * (n // n_test), n // n_test))
 
 
-def test_split_by_another_fraction():
+def test_split_scenes_by_other_fractions():
     assert [len(part) for part in split_scenes(list(range(30)), 0.1)] == [27, 3]
     assert [len(part) for part in split_scenes(list(range(30)), 0.0)] == [30, 0]
     with pytest.raises(InputError, match="test_fraction"):
@@ -74,7 +74,7 @@ def test_make_frames_errors(scenes, tmp_path):
         make_frames([scenes[0], Scene.open(tmp_path / "wide")], [[0], [0]], [[0], [0]])
 
 
-def test_draws_depend_on_seed_step_sample_and_purpose_only():
+def test_generator_depends_on_seed_step_sample_and_purpose_only():
     keys = [(1, 2, 3, "views"), (0, 2, 3, "views"), (1, 0, 3, "views"), (1, 2, 0, "views"), (1, 2, 3, "window")]
     drawn = [int(generator(*key).integers(2**60)) for key in keys]
     assert len(set(drawn)) == len(keys)

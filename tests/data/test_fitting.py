@@ -39,13 +39,13 @@ def opened(tmp_path, recording, **fitting):
     return Scene(tmp_path, recording, fitting=Fitting(**fitting))
 
 
-def test_nothing_asked_nothing_changed(tmp_path, made):
+def test_default_fitting_changes_nothing(tmp_path, made):
     plain, fitted = Scene(tmp_path, made[1]), opened(tmp_path, made[1])
     assert torch.equal(plain.images([0, 2], [1, 3]), fitted.images([0, 2], [1, 3]))
     assert plain.near == fitted.near and np.array_equal(plain.origin, fitted.origin)
 
 
-def test_images_are_scaled_to_cover_the_size_and_cropped_around_the_centre(tmp_path, made):
+def test_fit_scales_images_to_cover_and_crops_the_centre(tmp_path, made):
     made, recording = made
     scene = opened(tmp_path, recording, size=(48, 48))
     assert (scene.width, scene.height) == (48, 48)
@@ -58,7 +58,7 @@ def test_images_are_scaled_to_cover_the_size_and_cropped_around_the_centre(tmp_p
 
 
 @pytest.mark.parametrize("size", [(48, 48), (96, 48), (48, 64), (112, 96)])
-def test_cameras_follow_the_images(tmp_path, made, size):
+def test_fit_changes_intrinsics_with_images(tmp_path, made, size):
     """The ball is seen where the fitted cameras say that it is."""
     made, recording = made
     scene = opened(tmp_path, recording, size=size)
@@ -76,7 +76,7 @@ def test_cameras_follow_the_images(tmp_path, made, size):
                 assert np.abs(middle - pixel).max() < 1.0, (step, cam)
 
 
-def test_labels_keep_what_moves(tmp_path):
+def test_fit_keeps_moving_labels(tmp_path):
     made = make_scene(width=64, height=64, n_steps=1, n_cams=1)
     made.labels[:] = 0
     made.labels[0, 0, :, 32:] = 1
@@ -88,13 +88,13 @@ def test_labels_keep_what_moves(tmp_path):
     assert (labels[:, :7] == 0).all() and (labels[:, 8:] != 0).all()
 
 
-def test_depth_range(tmp_path, made):
+def test_fit_replaces_depth_range(tmp_path, made):
     scene = opened(tmp_path, made[1], near_far=(0.2, 4.0))
     cameras = scene.cameras_at([0], [0])
     assert (scene.near, scene.far, cameras.near.item(), cameras.far.item()) == pytest.approx((0.2, 4.0, 0.2, 4.0))
 
 
-def test_units_of_the_cameras(tmp_path, made):
+def test_fit_unit_cameras_scales_lengths(tmp_path, made):
     made, recording = made
     scene = opened(tmp_path, recording, unit_cameras=True)
     extent = np.abs(np.linalg.inv(made.viewmats[0])[:, :3, 3]).max()
@@ -108,19 +108,19 @@ def test_units_of_the_cameras(tmp_path, made):
     assert (both.near, both.far) == (0.2, 4.0)  # given in the new unit
 
 
-def test_cameras_at_the_origin_have_no_unit(tmp_path):
+def test_fit_unit_cameras_at_the_origin_changes_nothing(tmp_path):
     made = make_scene(n_steps=1, n_cams=1)
     made.viewmats[0, 0] = np.eye(4)
     scene = opened(tmp_path, record(tmp_path / "scene.json", made, bounds=None), unit_cameras=True)
     assert (scene.near, scene.far) == (1.0, 5.0)
 
 
-def test_images_are_never_enlarged(tmp_path, made):
+def test_fit_refuses_to_enlarge_images(tmp_path, made):
     with pytest.raises(InputError, match=r"scene.json: camera cam_0 has images of 120x96 pixels; .* at least 128x96"):
         opened(tmp_path, made[1], size=(128, 96))
 
 
-def test_problems_of_images_stay_problems(tmp_path):
+def test_fit_passes_unreadable_images_on(tmp_path):
     folder = write_scene(tmp_path / "scene", size=64)
     (folder / "cam_1" / "rgb_0002.png").write_bytes(b"no image")
     scene = Scene.open(folder, fitting=Fitting(size=(32, 32)))

@@ -14,7 +14,7 @@ from gsim3d.errors import InputError
 from tests.data.scene_folder import camera, write_scene
 
 
-def test_images_and_labels_come_back_as_written(tmp_path):
+def test_genesis_images_and_labels_equal_the_files(tmp_path):
     written = write_scene(tmp_path)
     scene = Scene.open(tmp_path)
     images = scene.images([2, 0], [3, 1, 1])
@@ -25,7 +25,7 @@ def test_images_and_labels_come_back_as_written(tmp_path):
     np.testing.assert_array_equal(labels[0, 0], written["seg"][0, 1])
 
 
-def test_attributes(tmp_path):
+def test_genesis_scene_attributes(tmp_path):
     folder = tmp_path / "ball" / "0003"
     write_scene(folder)
     scene = Scene.open(folder)
@@ -34,7 +34,7 @@ def test_attributes(tmp_path):
     assert scene.origin.dtype == np.float64 and scene.origin.tolist() == [-2.0, -2.0, -0.5]
 
 
-def test_cameras_keep_the_stored_convention(tmp_path):
+def test_genesis_cameras_equal_the_metadata(tmp_path):
     """Extrinsics are world-to-camera, intrinsics stay in pixels with the full principal point."""
     write_scene(tmp_path)
     cameras = Scene.open(tmp_path).cameras_at(range(3), [0])
@@ -47,7 +47,7 @@ def test_cameras_keep_the_stored_convention(tmp_path):
     assert cameras.image_cloud.tolist() == [0, 0, 0]
 
 
-def test_default_origin_bounds_the_frusta(tmp_path):
+def test_default_origin_is_lower_corner_of_the_frusta(tmp_path):
     write_scene(tmp_path, edits={"origin": None})
     scene = Scene.open(tmp_path)
     rng = np.random.default_rng(0)
@@ -67,13 +67,13 @@ def test_default_origin_bounds_the_frusta(tmp_path):
     np.testing.assert_allclose(frusta_origin(moved, Ks, [(32, 16)] * 3, 1.0, 4.0), scene.origin + shift, atol=1e-12)
 
 
-def test_published_metadata_needs_no_extras(tmp_path):
+def test_genesis_metadata_without_extras_is_read(tmp_path):
     write_scene(tmp_path, edits=dict.fromkeys(["fps", "near", "far", "origin"]))
     scene = Scene.open(tmp_path)
     assert (scene.fps, scene.near, scene.far) == (42.0, 1.0, 8.0)
 
 
-def test_labels_and_colours_are_never_shifted(tmp_path):
+def test_genesis_labels_and_colours_are_not_shifted(tmp_path):
     written = write_scene(tmp_path, n_steps=1, n_cams=1)
     import cv2
 
@@ -84,7 +84,7 @@ def test_labels_and_colours_are_never_shifted(tmp_path):
     assert (scene.images([0], [0]) == 7).all()
 
 
-def test_decoded_files_give_the_same_and_are_one_a_kind(tmp_path):
+def test_image_cache_files_equal_decoded_images(tmp_path):
     written = write_scene(tmp_path / "scene")
     cache = tmp_path / "cache"
     for _ in range(2):
@@ -100,7 +100,7 @@ def test_decoded_files_give_the_same_and_are_one_a_kind(tmp_path):
     assert len(os.listdir(cache)) == 2
 
 
-def test_decoded_files_that_are_not_ours_are_named(tmp_path):
+def test_image_cache_names_foreign_and_truncated_files(tmp_path):
     write_scene(tmp_path / "scene")
     Scene.open(tmp_path / "scene", cache_dir=tmp_path / "cache").images([0], [0])
     (file,) = (tmp_path / "cache").iterdir()
@@ -118,7 +118,7 @@ def test_decoded_files_that_are_not_ours_are_named(tmp_path):
 
 
 @pytest.mark.parametrize("cached", [True, False])
-def test_reading_leaves_no_file_open_from_any_thread(tmp_path, cached):
+def test_image_cache_leaves_no_file_open(tmp_path, cached):
     write_scene(tmp_path / "scene", n_steps=6, n_cams=5)
     expected = Scene.open(tmp_path / "scene").images(range(5), range(6))
     scenes = [Scene.open(tmp_path / "scene", cache_dir=tmp_path / "cache" if cached else None) for _ in range(30)]
@@ -129,7 +129,7 @@ def test_reading_leaves_no_file_open_from_any_thread(tmp_path, cached):
     assert all(torch.equal(stack, expected) for stack in stacks)
 
 
-def test_images_are_decoded_once(tmp_path):
+def test_image_cache_decodes_once(tmp_path):
     write_scene(tmp_path)
     scene = Scene.open(tmp_path)
     first = scene.images([0], [0])
@@ -195,7 +195,7 @@ MIRROR = [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         ({"cam_1": 3}, "cam_1 is missing"),
     ],
 )
-def test_broken_metadata_is_named(tmp_path, changes, message):
+def test_genesis_broken_metadata_is_named(tmp_path, changes, message):
     write_scene(tmp_path, edits=changes)
     with pytest.raises(InputError, match=message) as error:
         Scene.open(tmp_path)
@@ -203,13 +203,13 @@ def test_broken_metadata_is_named(tmp_path, changes, message):
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1]", "\0"])
-def test_metadata_that_is_no_json_object(tmp_path, text):
+def test_genesis_metadata_must_be_a_json_object(tmp_path, text):
     (tmp_path / "metadata.json").write_text(text)
     with pytest.raises(InputError, match="metadata.json"):
         Scene.open(tmp_path)
 
 
-def test_missing_metadata(tmp_path):
+def test_genesis_missing_metadata_is_named(tmp_path):
     with pytest.raises(InputError, match="not a scene folder"):
         Scene.open(tmp_path)
 
@@ -218,13 +218,13 @@ def test_missing_metadata(tmp_path):
     "template",
     ["../{img_type}_{cam_ix}_{n_step}", "/etc/{img_type}_{cam_ix}_{n_step}", "a/../../{img_type}/{cam_ix}/{n_step}"],
 )
-def test_template_may_not_leave_the_scene(tmp_path, template):
+def test_genesis_template_out_of_the_scene_is_refused(tmp_path, template):
     write_scene(tmp_path / "scene", edits={"file_path_template": template})
     with pytest.raises(InputError, match="out of the scene"):
         Scene.open(tmp_path / "scene").images([0], [0])
 
 
-def test_link_out_of_the_scene(tmp_path):
+def test_genesis_link_out_of_the_scene_is_refused(tmp_path):
     write_scene(tmp_path / "scene")
     write_scene(tmp_path / "other")
     link = tmp_path / "scene/rgb/cam_0/0000.png"
@@ -234,7 +234,7 @@ def test_link_out_of_the_scene(tmp_path):
         Scene.open(tmp_path / "scene").images([0], [0])
 
 
-def test_broken_images_are_named(tmp_path):
+def test_genesis_broken_images_are_named(tmp_path):
     import cv2
 
     write_scene(tmp_path, n_cams=1)
@@ -257,7 +257,7 @@ def test_broken_images_are_named(tmp_path):
         scene.images([0], [0])
 
 
-def test_numbers_out_of_range(tmp_path):
+def test_scene_refuses_numbers_out_of_range(tmp_path):
     write_scene(tmp_path)
     scene = Scene.open(tmp_path)
     with pytest.raises(InputError, match="camera 3 does not exist"):
@@ -266,6 +266,6 @@ def test_numbers_out_of_range(tmp_path):
         scene.segmentation([0], [-1])
 
 
-def test_metadata_written_by_json_round_trips(tmp_path):
+def test_genesis_metadata_round_trips_through_json(tmp_path):
     metadata = write_scene(tmp_path)["metadata"]
     assert json.loads((tmp_path / "metadata.json").read_text()) == metadata

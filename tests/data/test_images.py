@@ -52,7 +52,7 @@ MASKS = {
 
 
 @pytest.mark.parametrize("kind", MASKS)
-def test_masks_of_two_values_are_set_above_half_of_their_range(tmp_path, kind):
+def test_as_mask_thresholds_two_values_at_half(tmp_path, kind):
     name, convert, options = MASKS[kind]
     got = moving(stored(tmp_path, name, convert(discs()), *options), tmp_path / name)
     wrong = (got != (discs() > 0)).sum()
@@ -60,26 +60,26 @@ def test_masks_of_two_values_are_set_above_half_of_their_range(tmp_path, kind):
 
 
 @pytest.mark.parametrize("quality", [100, 95, 75, 50])
-def test_compression_noise_inside_of_a_png(tmp_path, quality):
+def test_as_mask_ignores_compression_noise(tmp_path, quality):
     noisy = stored(tmp_path, "m.jpg", discs(), cv2.IMWRITE_JPEG_QUALITY, quality)
     for image in (noisy, noisy.astype(np.uint16) * 257):
         np.testing.assert_array_equal(moving(stored(tmp_path, "m.png", image), tmp_path / "m.png"), discs() > 0)
 
 
-def test_soft_borders_are_cut_at_half(tmp_path):
+def test_as_mask_cuts_soft_borders_at_half(tmp_path):
     soft = cv2.GaussianBlur(discs(), (0, 0), 0.7)
     np.testing.assert_array_equal(moving(soft, tmp_path / "m.png"), soft > 127)
 
 
 @pytest.mark.parametrize("ids", [(1, 2), (1, 3), (7, 15), (85, 170), (128, 255), (1, 255), (300, 400)])
-def test_masks_of_labels_are_set_where_they_are_not_zero(tmp_path, ids):
+def test_as_mask_sets_labels_other_than_zero(tmp_path, ids):
     labels = discs(ids[0], np.uint16 if max(ids) > 255 else np.uint8)
     cv2.rectangle(labels, (40, 5), (60, 15), ids[1], -1)
     cv2.rectangle(labels, (2, 2), (9, 9), max(ids) // 2 + 1, -1)
     np.testing.assert_array_equal(moving(stored(tmp_path, "m.png", labels), tmp_path / "m.png"), labels > 0)
 
 
-def test_what_is_neither_mask_nor_labels_is_refused(tmp_path):
+def test_as_mask_refuses_photos(tmp_path):
     ramp = np.tile(np.linspace(0, 255, 64).astype(np.uint8), (48, 1))
     noise = np.random.default_rng(0).integers(0, 256, SIZE[::-1]).astype(np.uint8)
     three = discs()
@@ -93,7 +93,7 @@ def test_what_is_neither_mask_nor_labels_is_refused(tmp_path):
     assert moving(np.full_like(ramp, 255), tmp_path / "m.jpg").all()
 
 
-def test_jpeg_masks_of_a_scene(tmp_path):
+def test_scene_with_jpeg_masks(tmp_path):
     folder, made = write_videos(tmp_path, make_scene(width=64, height=48)), make_scene(width=64, height=48)
     (folder / "labels").rename(folder / "masks")
     for file in list((folder / "masks").rglob("*.png")):
@@ -113,7 +113,7 @@ ALPHA = np.random.default_rng(2).integers(0, 256, SIZE[::-1], dtype=np.uint8)
 
 @pytest.mark.parametrize("name", ["a.png", "a.tif", "a.tiff", "a.webp"])
 @pytest.mark.parametrize("deep", [False, True])
-def test_colours_of_8_and_16_bits_with_and_without_alpha(tmp_path, name, deep):
+def test_as_color_of_8_and_16_bits_with_and_without_alpha(tmp_path, name, deep):
     if deep and name == "a.webp":
         pytest.skip("WebP has 8 bits")
     scale = 257 if deep else 1
@@ -132,7 +132,7 @@ def test_colours_of_8_and_16_bits_with_and_without_alpha(tmp_path, name, deep):
 
 @pytest.mark.parametrize("layout, pattern", [("transforms", "images/**/*.png"), ("videos", "cam_*/*.png")])
 @pytest.mark.parametrize("deep", [False, True])
-def test_alpha_is_the_mask_where_there_is_none(tmp_path, layout, pattern, deep):
+def test_alpha_is_the_mask_of_scenes_without_masks(tmp_path, layout, pattern, deep):
     made = make_scene()
     folder = {"transforms": write_transforms, "videos": write_videos}[layout](tmp_path, made)
     for file in folder.glob(pattern):
@@ -151,7 +151,7 @@ def test_alpha_is_the_mask_where_there_is_none(tmp_path, layout, pattern, deep):
     np.testing.assert_array_equal(video, np.where((made.labels == MOVING)[..., None], made.rgb, 0))
 
 
-def test_films_that_are_opaque_have_no_mask(tmp_path):
+def test_opaque_videos_have_no_mask(tmp_path):
     folder = write_videos(tmp_path, make_scene())
     (folder / "labels").rename(folder / "elsewhere")
     for file in folder.glob("cam_*/*.png"):
@@ -159,7 +159,7 @@ def test_films_that_are_opaque_have_no_mask(tmp_path):
     assert not Scene.open(folder).has_segmentation()
 
 
-def test_headers_of_every_format(tmp_path):
+def test_read_header_of_every_format(tmp_path):
     rgba = np.concatenate([COLOUR, ALPHA[..., None]], -1)
     for name, image, alpha, options in (
         ("a.png", COLOUR, False, ()), ("a.png", rgba, True, ()), ("a.jpg", COLOUR, False, ()),
@@ -177,7 +177,7 @@ def test_headers_of_every_format(tmp_path):
 
 
 @pytest.mark.parametrize("chunk", [8, 33])
-def test_chunks_that_claim_more_than_the_file_has_are_not_decoded(chunk, tmp_path):
+def test_read_header_refuses_png_chunks_beyond_the_file(chunk, tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), COLOUR)
     data = bytearray((tmp_path / "a.png").read_bytes())
     for claimed in (len(data), 2**31 - 1, 2**32 - 1):
@@ -199,7 +199,7 @@ def big_endian_tiff() -> bytes:
     return b"MM\0*" + struct.pack(">I", 8 + len(pixels)) + pixels + struct.pack(">H", len(entries)) + tags + bytes(4)
 
 
-def test_tiff_of_either_byte_order_and_of_one_page(tmp_path):
+def test_read_header_of_tiff_byte_orders_and_pages(tmp_path):
     file = tmp_path / "a.tif"
     file.write_bytes(big_endian_tiff())
     np.testing.assert_array_equal(read_image(file, SIZE, "", Problems()), discs())
@@ -222,7 +222,7 @@ def test_tiff_of_either_byte_order_and_of_one_page(tmp_path):
         read_image(file, SIZE, "", Problems())
 
 
-def test_labels_are_lossless(tmp_path):
+def test_as_labels_refuses_lossy_files(tmp_path):
     labels = discs(3)
     for name in ("a.png", "a.tif"):
         for dtype in (np.uint8, np.uint16):
@@ -233,7 +233,7 @@ def test_labels_are_lossless(tmp_path):
             as_labels(stored(tmp_path, name, image), tmp_path / name, "", Problems())
 
 
-def test_rgba_of_the_genesis_layout_is_composed_on_black(tmp_path):
+def test_genesis_rgba_is_composed_on_black(tmp_path):
     folder, made = write_genesis(tmp_path, make_scene()), make_scene()
     for file in folder.rglob("rgb_*.png"):
         image = cv2.imread(str(file))

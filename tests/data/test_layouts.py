@@ -35,7 +35,7 @@ def made(request):
 
 
 @pytest.mark.parametrize("layout", WRITERS)
-def test_every_layout_gives_the_same_scene(tmp_path, made, layout):
+def test_layouts_give_the_same_scene(tmp_path, made, layout):
     scene = Scene.open(WRITERS[layout](tmp_path / "scene", made))
     assert scene.layout == layout.split("'")[0]
     assert (scene.n_steps, scene.n_cams, scene.width, scene.height) == (N_STEPS, N_CAMS, WIDTH, HEIGHT)
@@ -51,7 +51,7 @@ def test_every_layout_gives_the_same_scene(tmp_path, made, layout):
 
 
 @pytest.mark.parametrize("layout", WRITERS)
-def test_the_ball_projects_to_where_it_was_drawn(tmp_path, made, layout):
+def test_layouts_project_the_ball_to_its_pixels(tmp_path, made, layout):
     scene = Scene.open(WRITERS[layout](tmp_path, made))
     images = scene.images(CAMS, STEPS).flatten(0, 1)
     cameras = scene.cameras_at(CAMS, STEPS)
@@ -65,7 +65,7 @@ def test_the_ball_projects_to_where_it_was_drawn(tmp_path, made, layout):
 
 
 @pytest.mark.parametrize("layout", WRITERS)
-def test_frames_carry_the_cameras_of_their_step(tmp_path, layout):
+def test_make_frames_has_cameras_of_each_step(tmp_path, layout):
     made = make_scene(moving=True)
     frames = make_frames([Scene.open(WRITERS[layout](tmp_path, made))], [[2, 0]], [[1, 3]])
     for row, (step, cam) in enumerate([(1, 2), (1, 0), (3, 2), (3, 0)]):
@@ -76,7 +76,7 @@ def test_frames_carry_the_cameras_of_their_step(tmp_path, layout):
 
 @pytest.mark.parametrize("layout", ["genesis", "transforms", "videos"])
 @pytest.mark.parametrize("moving", [False, True])
-def test_intrinsics_may_change_with_time(tmp_path, layout, moving):
+def test_layouts_read_changing_intrinsics(tmp_path, layout, moving):
     made = make_scene(moving=moving, zoom=0.1)
     scene = Scene.open(WRITERS[layout](tmp_path, made))
     cameras = scene.cameras_at(CAMS, STEPS)
@@ -85,7 +85,7 @@ def test_intrinsics_may_change_with_time(tmp_path, layout, moving):
     assert not torch.equal(cameras.Ks[0], cameras.Ks[-N_CAMS])
 
 
-def test_the_same_lens_in_two_layouts(tmp_path):
+def test_layouts_undistort_the_same_lens_alike(tmp_path):
     lens = {"k1": 0.2, "k2": 0.05, "p1": 0.002, "p2": -0.004, "k3": 0.01}
     made = make_scene(zoom=0.05)
     videos, transforms = write_videos(tmp_path / "videos", made), write_transforms(tmp_path / "transforms", made)
@@ -102,14 +102,14 @@ def test_the_same_lens_in_two_layouts(tmp_path):
     assert not (one.segmentation(CAMS, STEPS)[~one.valid(CAMS, STEPS)]).any()
 
 
-def test_cameras_stand_still_after_the_end_of_the_film(tmp_path):
+def test_cameras_at_steps_beyond_the_end_equal_the_last(tmp_path):
     scene = Scene.open(write_videos(tmp_path, make_scene(moving=True)))
     cameras = scene.cameras_at([1], [2, 3, 4, 9])
     assert torch.equal(cameras.viewmats[1], cameras.viewmats[3]) and cameras.image_cloud.tolist() == [0, 1, 2, 3]
     assert not torch.equal(cameras.viewmats[0], cameras.viewmats[1])
 
 
-def test_a_data_set_may_mix_layouts(tmp_path):
+def test_find_scenes_of_mixed_layouts(tmp_path):
     made = make_scene()
     for name, write in (("a/2", write_genesis), ("a/10", write_videos), ("b", write_kubric), (".c", write_videos)):
         write(tmp_path / name, made)
@@ -120,7 +120,7 @@ def test_a_data_set_may_mix_layouts(tmp_path):
     assert find_scenes(tmp_path / "b") == [tmp_path / "b"]
 
 
-def test_a_single_kubric_camera_is_a_scene(tmp_path):
+def test_kubric_single_camera_is_a_scene(tmp_path):
     made = make_scene()
     write_kubric(tmp_path, made)
     scene = Scene.open(tmp_path / "cam_1")
@@ -128,7 +128,7 @@ def test_a_single_kubric_camera_is_a_scene(tmp_path):
     np.testing.assert_array_equal(scene.images([0], STEPS)[:, 0].permute(0, 2, 3, 1), made.rgb[:, 1])
 
 
-def test_the_number_of_a_kubric_frame_is_that_of_its_pose(tmp_path):
+def test_kubric_frame_number_is_the_number_of_its_pose(tmp_path):
     made = make_scene(moving=True)
     write_kubric(tmp_path, made)
     for file in [*tmp_path.rglob("*_0.png"), *tmp_path.rglob("*_2.png")]:
@@ -140,6 +140,6 @@ def test_the_number_of_a_kubric_frame_is_that_of_its_pose(tmp_path):
     np.testing.assert_array_equal(scene.segmentation(CAMS, [0, 1]), made.labels[[1, 3]])
 
 
-def test_a_folder_without_any_layout_is_named(tmp_path):
+def test_layout_of_other_folders_is_an_error(tmp_path):
     with pytest.raises(InputError, match="no metadata.json, transforms.json, cameras.json or sparse/0"):
         Scene.open(tmp_path)

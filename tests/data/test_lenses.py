@@ -30,7 +30,7 @@ def in_lens(ray: np.ndarray, lens: Lens) -> np.ndarray:
     ("OPENCV_FISHEYE", FISHEYE), ("OPENCV", RATIONAL), ("FULL_OPENCV", RATIONAL),
     ("SIMPLE_RADIAL_FISHEYE", {"k1": -0.05}), ("RADIAL", {"k1": 0.1, "k2": 0.02}),
 ])  # fmt: skip
-def test_undistorted_pixels_come_from_where_the_lens_puts_their_rays(model, keys):
+def test_undistorter_samples_the_distorted_rays(model, keys):
     lens = lens_of({"camera_model": model, **keys}, "", Problems())
     y, x = np.mgrid[:160, :200].astype(np.float32)
     undistorter = Undistorter(lens, (200, 160))
@@ -74,7 +74,7 @@ KEYS = {
 
 @pytest.mark.parametrize("kind", KEYS)
 @pytest.mark.parametrize("where", ["top", "frames", "both"])
-def test_every_published_key_is_used(tmp_path, kind, where):
+def test_lens_of_uses_every_published_key(tmp_path, kind, where):
     keys, wanted = KEYS[kind]
     if where == "both":  # what frames say wins
         wrong = {key: 0.77 if isinstance(value, float) else value for key, value in keys.items()}
@@ -111,23 +111,23 @@ REFUSED = [
 
 @pytest.mark.parametrize("keys, message", REFUSED)
 @pytest.mark.parametrize("where", ["top", "frames"])
-def test_other_lenses_are_refused_by_name(tmp_path, keys, message, where):
+def test_lens_of_refuses_other_lenses_by_name(tmp_path, keys, message, where):
     with pytest.raises(InputError, match="transforms.json: camera .*frame 0.*" + message):
         opened(tmp_path, *((keys,) if where == "top" else ({}, keys)))
 
 
-def test_keys_of_other_lenses_that_say_nothing_are_no_lens(tmp_path):
+def test_lens_of_ignores_zero_keys_of_other_lenses(tmp_path):
     keys = {"rolling_shutter": [0, 0, 0, 0], "latlong": False, "s1": 0, "lens": "50 mm"}
     assert opened(tmp_path, keys).valid([0], [0]) is None
 
 
-def test_masks_of_a_fisheye_keep_their_values(tmp_path):
+def test_undistorter_keeps_values_of_masks(tmp_path):
     scene = opened(tmp_path, {"camera_model": "OPENCV_FISHEYE", **FISHEYE})
     labels = scene.segmentation(range(3), range(4))
     assert set(labels.unique().tolist()) == {0, 1, 3} and not labels[~scene.valid(range(3), range(4))].any()
 
 
-def test_a_fisheye_scene_shows_what_a_pinhole_sees(tmp_path):
+def test_fisheye_scene_equals_pinhole_scene(tmp_path):
     """Each image is drawn as the fisheye sees it; undistorted, it is the one of the pinhole."""
     made = make_scene(width=96, height=64)
     write_transforms(tmp_path, made)
@@ -152,7 +152,7 @@ def test_a_fisheye_scene_shows_what_a_pinhole_sees(tmp_path):
 
 
 @pytest.mark.parametrize("lens", [Lens(np.array([-0.6, 0, 0, 0, 0])), Lens(np.array([-0.5, 0, 0, 0]), True)])
-def test_where_a_polynomial_turns_back_nothing_was_filmed(lens):
+def test_undistorter_marks_folded_rays_as_not_recorded(lens):
     """Beyond that radius it would show again, mirrored, what lies farther inside."""
     undistorter = Undistorter(lens, (200, 160))
     wide = K * [[0.4, 0, 1], [0, 0.4, 1], [0, 0, 1]]  # without the skew
@@ -163,7 +163,7 @@ def test_where_a_polynomial_turns_back_nothing_was_filmed(lens):
     assert not undistorter(np.full((160, 200), 255, np.uint8), wide)[~valid].any() and not valid[0, 0]
 
 
-def test_lenses_of_films(tmp_path):
+def test_videos_layout_lens_keys(tmp_path):
     folder = write_videos(tmp_path, make_scene())
 
     def lens(**keys):
@@ -189,7 +189,7 @@ def test_lenses_of_films(tmp_path):
             lens(**keys)
 
 
-def test_a_lens_that_changes_with_time_is_refused(tmp_path):
+def test_changing_lens_is_refused(tmp_path):
     write_transforms(tmp_path, make_scene())
     content = json.loads((tmp_path / "transforms.json").read_text())
     content["frames"][4]["camera_model"] = "OPENCV_FISHEYE"

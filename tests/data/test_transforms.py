@@ -35,7 +35,7 @@ def write_synthetic(folder, made, splits, times=None, suffix=".png", **top):
     return focal
 
 
-def test_the_views_of_nerf_synthetic_are_cameras_of_one_step(tmp_path):
+def test_nerf_synthetic_views_are_cameras_of_one_step(tmp_path):
     made = make_scene(n_steps=1, n_cams=5)
     focal = write_synthetic(tmp_path, made, {"train": [(0, 0), (0, 1), (0, 2)], "test": [(0, 3)], "val": [(0, 4)]})
     scene = Scene.open(tmp_path)
@@ -50,7 +50,7 @@ def test_the_views_of_nerf_synthetic_are_cameras_of_one_step(tmp_path):
 
 
 @pytest.mark.parametrize("count", [1, 4])
-def test_d_nerf_is_one_camera_that_moves(tmp_path, count):
+def test_d_nerf_is_one_moving_camera(tmp_path, count):
     made = make_scene(moving=True, n_steps=6)
     rows = [(step, step % 3) for step in range(6)]
     write_synthetic(tmp_path, made, {"train": rows, "test": rows[:count]}, times=np.linspace(0, 1, 6).tolist())
@@ -62,7 +62,7 @@ def test_d_nerf_is_one_camera_that_moves(tmp_path, count):
     assert check_scene(tmp_path).problems == ()
 
 
-def test_held_out_cameras_of_the_same_times_are_cameras(tmp_path):
+def test_nerf_splits_of_the_same_times_are_cameras(tmp_path):
     made = make_scene(n_steps=4)
     splits = {"train": [(step, 0) for step in range(4)], "test": [(step, 1) for step in range(4)]}
     write_synthetic(tmp_path, made, splits, times=[0, 0.25, 0.5, 0.75])
@@ -71,7 +71,7 @@ def test_held_out_cameras_of_the_same_times_are_cameras(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".webp"])
-def test_paths_without_suffix(tmp_path, suffix):
+def test_transforms_paths_without_suffix(tmp_path, suffix):
     made = make_scene(n_steps=1)
     write_synthetic(tmp_path, made, {"train": [(0, 0), (0, 1)]}, suffix=suffix)
     for number in range(2):
@@ -83,7 +83,7 @@ def test_paths_without_suffix(tmp_path, suffix):
     assert Scene.open(tmp_path).recorded_images([0, 1], [0]).float().mean() > 5
 
 
-def test_the_angles_of_both_axes_and_of_single_frames(tmp_path):
+def test_transforms_camera_angles_of_axes_and_frames(tmp_path):
     made = make_scene(n_steps=1)
     write_synthetic(tmp_path, made, {"train": [(0, 0), (0, 1)]}, camera_angle_y=0.5)
     own = {"camera_angle_x": 0.7, "cx": 20.0, "w": 48, "h": 32}
@@ -98,7 +98,7 @@ def test_the_angles_of_both_axes_and_of_single_frames(tmp_path):
             Scene.open(tmp_path)
 
 
-def test_transforms_json_wins_over_the_splits(tmp_path):
+def test_transforms_json_precedes_the_splits(tmp_path):
     made = make_scene(n_steps=1)
     write_synthetic(tmp_path, made, {"train": [(0, 0), (0, 1), (0, 2)]})
     write_transforms(tmp_path, make_scene(n_steps=2))
@@ -117,7 +117,7 @@ MISSING = {
 
 @pytest.mark.parametrize("key", MISSING)
 @pytest.mark.parametrize("how", ["removed", "null"])
-def test_missing_keys_are_named_as_missing(tmp_path, key, how):
+def test_transforms_missing_keys_are_named(tmp_path, key, how):
     write_transforms(tmp_path, make_scene())
 
     def edit(content):
@@ -134,14 +134,14 @@ def test_missing_keys_are_named_as_missing(tmp_path, key, how):
 
 
 @pytest.mark.parametrize("value", [True, "1.0", [[1, 0, 0, "x"]] * 4, [[True] * 4] * 4, [[None] * 4] * 4, {"a": 1}])
-def test_values_of_a_wrong_type_are_named(tmp_path, value):
+def test_transforms_wrong_types_are_named(tmp_path, value):
     write_transforms(tmp_path, make_scene())
     edit_json(tmp_path / "transforms.json", lambda content: content["frames"][0].update(transform_matrix=value))
     with pytest.raises(InputError, match="transform_matrix of camera .* (must be numbers|holds null)"):
         Scene.open(tmp_path)
 
 
-def test_two_frames_of_one_camera_need_times(tmp_path):
+def test_transforms_frames_of_one_camera_need_times(tmp_path):
     write_transforms(tmp_path, make_scene())
 
     def edit(content):
@@ -158,7 +158,7 @@ def test_two_frames_of_one_camera_need_times(tmp_path):
     rb'{"frames": [{"file_path": "\xff.png"}]}', rb'{"frames": [{"file_path": "a\ud800.png"}]}',
     rb'{"frames": [], "na\udc80me": 1}', b'{"frames": [{"file_path": "\xed\xa0\x80.png"}]}',
 ])  # fmt: skip
-def test_text_that_no_file_can_be_named_by_is_refused(tmp_path, text):
+def test_transforms_unusable_paths_are_refused(tmp_path, text):
     """Bytes that are no UTF-8, and halves of surrogate pairs, which can neither be printed nor opened."""
     for name in ("transforms.json", "cameras.json", "metadata.json"):
         folder = tmp_path / name[:5]
@@ -169,7 +169,7 @@ def test_text_that_no_file_can_be_named_by_is_refused(tmp_path, text):
         str(error.value).encode()
 
 
-def test_names_beyond_latin_are_names(tmp_path):
+def test_transforms_paths_may_be_unicode(tmp_path):
     write_transforms(tmp_path, make_scene(n_steps=1))
     edit_json(
         tmp_path / "transforms.json",
@@ -178,7 +178,7 @@ def test_names_beyond_latin_are_names(tmp_path):
     assert Scene.open(tmp_path).camera_names[0].endswith("\U0001f3a5é")
 
 
-def test_utm_coordinates_keep_their_digits(tmp_path):
+def test_transforms_utm_coordinates_keep_their_digits(tmp_path):
     made = make_scene()
     write_transforms(tmp_path, made)
     where = np.array([500000.0, 4649776.0, 100.0])
@@ -199,7 +199,7 @@ def test_utm_coordinates_keep_their_digits(tmp_path):
         np.testing.assert_allclose(seen, wanted[:3, :3] @ point + wanted[:3, 3], atol=1e-8)
 
 
-def test_mixed_masks_of_one_scene(tmp_path):
+def test_transforms_masks_and_labels_may_mix(tmp_path):
     """A frame without a mask is named, whether its image has alpha or not."""
     write_transforms(tmp_path, make_scene())
     edit_json(tmp_path / "transforms.json", lambda content: content["frames"][-1].pop("label_path"))

@@ -81,7 +81,7 @@ def odd(tmp_path_factory):
     return folder, write_odd_videos(folder)
 
 
-def test_odd_sizes_are_padded_and_the_padding_is_no_pixel(odd):
+def test_odd_sizes_are_padded_and_padding_is_not_valid(odd):
     folder, _ = odd
     scene = Scene.open(folder)
     assert (scene.width, scene.height) == (48, 32)
@@ -99,7 +99,7 @@ def test_odd_sizes_are_padded_and_the_padding_is_no_pixel(odd):
     assert torch.equal(frames.valid, valid[0]) and not (frames.masks & ~frames.valid).any()
 
 
-def test_lenses_are_undistorted(odd):
+def test_videos_are_undistorted(odd):
     """The undistorted video is what a pinhole sees, up to the blur of two interpolations."""
     folder, truth = odd
     scene = Scene.open(folder)
@@ -116,7 +116,7 @@ def test_lenses_are_undistorted(odd):
     assert np.mean(with_lens) > 0.9
 
 
-def test_undistorted_pixels_come_from_where_the_lens_puts_their_rays():
+def test_undistorter_samples_the_distorted_rays_of_videos():
     """An image that holds its own coordinates shows where each pixel of the result was taken."""
     K = np.array([[200.0, 0, 101.5], [0, 210.0, 76.0], [0, 0, 1]])
     y, x = np.mgrid[:160, :200].astype(np.float32)
@@ -128,7 +128,7 @@ def test_undistorted_pixels_come_from_where_the_lens_puts_their_rays():
         assert np.abs(in_lens - [column + 0.5, row + 0.5]).max() > 0.1 or (column, row) == (101, 76)
 
 
-def test_the_background_is_subtracted_and_painted_black(odd):
+def test_videos_background_is_subtracted_and_painted_black(odd):
     folder, truth = odd
     scene = Scene.open(folder)
     labels, images = scene.segmentation(range(3), range(N_LONG)), scene.images(range(3), range(N_LONG))
@@ -151,7 +151,7 @@ def test_the_background_is_subtracted_and_painted_black(odd):
         edit_json(folder / "cameras.json", lambda content: content.pop("masks"))
 
 
-def test_masks_beside_the_frames(tmp_path):
+def test_videos_mask_folders_are_read(tmp_path):
     made = make_scene()
     folder = write_videos(tmp_path, made)
     (folder / "labels").rename(folder / "masks")
@@ -185,7 +185,7 @@ def videos(tmp_path_factory):
     return write_encoded(tmp_path_factory.mktemp("videos") / "scene", made), made
 
 
-def test_videos(videos):
+def test_encoded_videos_equal_their_frames(videos):
     folder, made = videos
     scene = Scene.open(folder)
     assert (scene.n_steps, scene.n_cams, scene.fps) == (9, 3, FPS)
@@ -196,7 +196,7 @@ def test_videos(videos):
         assert torch.equal(Scene.open(folder).recorded_images([1], steps), whole[steps][:, [1]])
 
 
-def test_no_file_stays_open(videos):
+def test_encoded_videos_leave_no_file_open(videos):
     folder, _ = videos
     scene = Scene.open(folder)
     before = len(os.listdir("/proc/self/fd"))
@@ -208,7 +208,7 @@ def test_no_file_stays_open(videos):
     assert len(os.listdir("/proc/self/fd")) <= before
 
 
-def test_broken_videos(videos, tmp_path):
+def test_broken_videos_are_named(videos, tmp_path):
     folder, made = videos
     broken = write_encoded(tmp_path / "scene", make_scene(width=96, height=64, n_steps=9))
     file = broken / "video_1.mp4"
@@ -229,7 +229,7 @@ def test_broken_videos(videos, tmp_path):
         Scene.open(broken)
 
 
-def test_a_video_that_is_cut_off_is_named(videos, tmp_path):
+def test_truncated_video_is_named(videos, tmp_path):
     """In AVI the frames come before their index, so that a file without its end can still be opened."""
     _, made = videos
     folder = write_encoded(tmp_path / "scene", made)
@@ -248,7 +248,7 @@ def test_a_video_that_is_cut_off_is_named(videos, tmp_path):
     assert any("video_2" in problem for problem in check_scene(folder).problems)
 
 
-def test_images_that_are_cut_off_are_named(tmp_path):
+def test_truncated_images_are_named(tmp_path):
     """OpenCV fills the rest of a JPEG with grey; a thumbnail's end inside the header is not the end of the image."""
     folder = write_videos(tmp_path, make_scene())
     for file in (folder / "cam_1").glob("*.png"):
@@ -269,7 +269,7 @@ def test_images_that_are_cut_off_are_named(tmp_path):
             Scene.open(folder).recorded_images([1], [2])
 
 
-def test_frame_numbers_are_times(tmp_path):
+def test_videos_frame_numbers_are_times(tmp_path):
     scene = Scene.open(write_videos(tmp_path, make_scene(), stride=3))
     assert scene.fps == pytest.approx(FPS) and scene.n_steps == N_STEPS
     edit_json(tmp_path / "cameras.json", lambda content: content.pop("fps"))
@@ -277,7 +277,7 @@ def test_frame_numbers_are_times(tmp_path):
         Scene.open(tmp_path)
 
 
-def test_units_and_pixel_centres(tmp_path):
+def test_videos_units_and_pixel_centres(tmp_path):
     plain = Scene.open(write_videos(tmp_path, make_scene()))
 
     def edit(content):
@@ -301,7 +301,7 @@ def test_units_and_pixel_centres(tmp_path):
         edit_json(tmp_path / "cameras.json", lambda content: content.pop(key))
 
 
-def test_a_memory_mapped_film_is_the_same(odd, tmp_path):
+def test_image_cache_files_equal_videos(odd, tmp_path):
     folder, _ = odd
     mapped, plain = Scene.open(folder, cache_dir=tmp_path / "cache"), Scene.open(folder)
     for scene in (mapped, Scene.open(folder, cache_dir=tmp_path / "cache")):
@@ -343,7 +343,7 @@ def test_transforms_name_cameras_by_key_or_path(tmp_path):
         Scene.open(tmp_path)
 
 
-def test_no_loss_and_no_metric_sees_the_padding(odd, tmp_path, one_thread):
+def test_loss_and_metrics_leave_padding_out(odd, tmp_path, one_thread):
     """Other colours in pixels that were not filmed change neither the loss nor its gradient, elsewhere they do."""
     scene = Scene.open(odd[0])
     data, phase = DataConfig(history=1, context_views=2), PhaseConfig(steps=1, horizon=1, target_views=3)
@@ -369,7 +369,7 @@ def test_no_loss_and_no_metric_sees_the_padding(odd, tmp_path, one_thread):
     assert not torch.equal(result(~nowhere)[0], loss)
 
 
-def test_train_simulate_evaluate_and_check_on_films(odd, tmp_path, capsys, one_thread):
+def test_commands_run_on_videos(odd, tmp_path, capsys, one_thread):
     folder, _ = odd
     (tmp_path / "train.yaml").write_text(
         "data: {history: 2, context_views: 2}\nphases:\n  - {steps: 1, horizon: 1, target_views: 2}\n"

@@ -35,7 +35,7 @@ def frames_of(scene: Scene) -> list[list[int]]:
 
 
 @pytest.mark.parametrize("suffix", [*SUFFIXES, ".avi"])
-def test_frames_are_counted_by_decoding(tmp_path, suffix):
+def test_video_frames_are_counted_by_decoding(tmp_path, suffix):
     write_plain(tmp_path / f"a{suffix}")
     scene = Scene.open(write_scene(tmp_path, ["a"]))
     assert (scene.n_steps, scene.fps, scene.recording.notes) == (N_FRAMES, RATE, ())
@@ -44,7 +44,7 @@ def test_frames_are_counted_by_decoding(tmp_path, suffix):
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
 @pytest.mark.parametrize("gaps", [UNEVEN, [50] * 12 + [100] + [50] * 6, [100] + [50] * 18, [33, 67] * 9 + [33]])
-def test_uneven_films_are_refused_with_both_numbers(tmp_path, suffix, gaps):
+def test_uneven_videos_are_refused_with_both_numbers(tmp_path, suffix, gaps):
     with_gaps(write_plain(tmp_path / f"a{suffix}"), gaps)
     write_scene(tmp_path, ["a"])
     message = rf"a{suffix} \(camera a\) is uneven: its 20 frames are {min(gaps)} to {max(gaps)} ms apart.*resample"
@@ -57,7 +57,7 @@ def test_uneven_films_are_refused_with_both_numbers(tmp_path, suffix, gaps):
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_uneven_films_are_resampled_on_request(tmp_path, suffix):
+def test_uneven_videos_are_resampled_on_request(tmp_path, suffix):
     with_gaps(write_plain(tmp_path / f"a{suffix}"), UNEVEN)
     scene = Scene.open(write_scene(tmp_path, ["a"], resample=4))
     times = np.cumsum([0, *UNEVEN]) / 1000
@@ -72,7 +72,7 @@ def test_uneven_films_are_resampled_on_request(tmp_path, suffix):
 
 
 @pytest.mark.parametrize("apart", [1, 2])
-def test_frames_that_lie_apart_at_the_end_are_left_out(tmp_path, apart):
+def test_video_frames_apart_at_the_end_are_left_out(tmp_path, apart):
     """A cut without encoding anew takes away the frames before them."""
     with_gaps(write_plain(tmp_path / "a.mp4"), [50] * (19 - apart) + [100] * apart)
     scene = Scene.open(write_scene(tmp_path, ["a"]))
@@ -80,14 +80,14 @@ def test_frames_that_lie_apart_at_the_end_are_left_out(tmp_path, apart):
     assert f"its last {apart} of 20 frames lie apart and are left out" in describe(scene)
 
 
-def test_small_jitter_is_no_unevenness(tmp_path):
+def test_video_rate_tolerates_small_jitter(tmp_path):
     with_gaps(write_plain(tmp_path / "a.mp4"), [50 + (2, -2, 0)[k % 3] for k in range(19)])
     with_gaps(write_plain(tmp_path / "b.mkv"), [40] * 19)  # at another rate than the header's, evenly
     assert Scene.open(write_scene(tmp_path, ["a"])).fps == pytest.approx(RATE, rel=0.01)
     assert Scene.open(write_scene(tmp_path, ["b"])).fps == pytest.approx(25)
 
 
-def test_frames_that_an_edit_list_leaves_out_are_none(tmp_path):
+def test_video_edit_lists_are_applied(tmp_path):
     for skipped in (0.2, 0.4, 0.75):
         trimmed(write_plain(tmp_path / "a.mp4"), skipped)
         scene = Scene.open(write_scene(tmp_path, ["a"]))
@@ -95,7 +95,7 @@ def test_frames_that_an_edit_list_leaves_out_are_none(tmp_path):
         assert frames_of(scene) == [list(range(first, N_FRAMES))] and scene.fps == RATE
 
 
-def test_films_that_start_late_are_aligned_by_time(tmp_path):
+def test_late_videos_are_aligned_by_time(tmp_path):
     """Frame k of one and frame k - 6 of the other show one time."""
     write_plain(tmp_path / "a.mp4")
     trimmed(write_plain(tmp_path / "b.mp4"), 0.0, late=0.3)
@@ -109,7 +109,7 @@ def test_films_that_start_late_are_aligned_by_time(tmp_path):
     assert frames_of(alone) == [list(range(20))] and alone.recording.notes == ()
 
 
-def test_labels_of_a_film_that_starts_late_count_its_own_frames(tmp_path):
+def test_labels_of_late_videos_have_their_own_frame_numbers(tmp_path):
     write_plain(tmp_path / "a.mp4")
     trimmed(write_plain(tmp_path / "b.mp4"), 0.0, late=0.3)
     for name in ("a", "b"):
@@ -125,7 +125,7 @@ def test_labels_of_a_film_that_starts_late_count_its_own_frames(tmp_path):
 
 @pytest.mark.parametrize("seconds", [3.0, 1.4, None])
 @pytest.mark.parametrize("suffix", [".webm", ".mkv"])
-def test_the_duration_of_a_container_is_not_that_of_its_film(tmp_path, suffix, seconds):
+def test_container_duration_has_no_influence(tmp_path, suffix, seconds):
     """A longer sound track makes it longer; a live recording has none."""
     with_duration(write_plain(tmp_path / f"a{suffix}"), seconds)
     scene = Scene.open(write_scene(tmp_path, ["a"]))
@@ -134,7 +134,7 @@ def test_the_duration_of_a_container_is_not_that_of_its_film(tmp_path, suffix, s
 
 @pytest.mark.parametrize("matrix, turn, corner", [((0, 1, -1, 0), 90, (0, -1)), ((-1, 0, 0, -1), 180, (-1, -1)),
                                                   ((0, -1, 1, 0), 270, (-1, 0))])  # fmt: skip
-def test_turned_films_are_turned(tmp_path, matrix, turn, corner):
+def test_video_display_matrix_is_applied(tmp_path, matrix, turn, corner):
     with_matrix(write_plain(tmp_path / "a.mp4"), *matrix)
     size = (64, 48) if turn == 180 else (48, 64)
     video = Scene.open(write_scene(tmp_path, ["a"], size=size)).recorded_images([0], [3])[0, 0, 0, : size[1], : size[0]]
@@ -146,13 +146,13 @@ def test_turned_films_are_turned(tmp_path, matrix, turn, corner):
 
 
 @pytest.mark.parametrize("matrix", [(-1, 0, 0, 1), (1, 0, 0, -1), (1, 1, -1, 1)])
-def test_mirrored_and_slanting_films_are_refused(tmp_path, matrix):
+def test_mirrored_and_slanting_videos_are_refused(tmp_path, matrix):
     with_matrix(write_plain(tmp_path / "a.mp4"), *matrix)
     with pytest.raises(InputError, match=r"a.mp4 \(camera a\) is shown mirrored or aslant"):
         Scene.open(write_scene(tmp_path, ["a"]))
 
 
-def test_films_of_different_rates(tmp_path):
+def test_videos_of_different_rates_are_refused(tmp_path):
     write_plain(tmp_path / "a.mp4")
     write_plain(tmp_path / "b.webm", n_frames=30, rate=30)
     for keys in ({}, {"fps": 20}):
@@ -162,7 +162,7 @@ def test_films_of_different_rates(tmp_path):
     assert scene.fps == 10 and frames_of(scene) == [list(range(0, 20, 2)), [number % 20 for number in range(0, 30, 3)]]
 
 
-def test_fps_replaces_the_rate_of_even_films(tmp_path):
+def test_fps_replaces_the_rate_of_even_videos(tmp_path):
     """Slow motion is stored at the rate at which it is played."""
     write_plain(tmp_path / "a.mp4")
     scene = Scene.open(write_scene(tmp_path, ["a"], fps=240))
@@ -179,7 +179,7 @@ def test_fps_replaces_the_rate_of_even_films(tmp_path):
 
 @pytest.mark.parametrize("suffix", [*SUFFIXES, ".avi"])
 @pytest.mark.parametrize("share", [0.5, 0.97])
-def test_films_that_are_cut_off_are_named(tmp_path, suffix, share):
+def test_truncated_videos_are_named(tmp_path, suffix, share):
     file = write_plain(tmp_path / f"a{suffix}")
     data = file.read_bytes()
     file.write_bytes(data[: round(len(data) * share)])
@@ -187,7 +187,7 @@ def test_films_that_are_cut_off_are_named(tmp_path, suffix, share):
         Scene.open(write_scene(tmp_path, ["a"]))
 
 
-def test_a_film_whose_end_is_damaged_is_no_shorter_film(tmp_path):
+def test_video_with_damaged_end_is_refused(tmp_path):
     file = write_plain(tmp_path / "a.mp4")
     data = bytearray(file.read_bytes())
     index, start = data.find(b"moov") - 4, data.find(b"mdat") + 4
@@ -197,14 +197,14 @@ def test_a_film_whose_end_is_damaged_is_no_shorter_film(tmp_path):
         Scene.open(write_scene(tmp_path, ["a"]))
 
 
-def test_time_stamps_that_stand_still_are_none(tmp_path):
+def test_constant_time_stamps_are_refused(tmp_path):
     file = write_plain(tmp_path / "a.mp4")
     edit_boxes(file, {b"stts": lambda old: old[:-4] + bytes(4)})
     with pytest.raises(InputError, match=r"a.mp4 \(camera a\) (has no usable time stamps|is uneven|cannot be decoded)"):
         Scene.open(write_scene(tmp_path, ["a"]))
 
 
-def test_a_path_that_is_not_utf8_is_refused(tmp_path):
+def test_video_path_that_is_not_utf8_is_refused(tmp_path):
     """OpenCV ends the process there."""
     folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xff"))
     folder.mkdir()

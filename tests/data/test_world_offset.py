@@ -41,7 +41,7 @@ def centers(viewmats):
 @pytest.mark.parametrize("moving", [False, True])
 @pytest.mark.parametrize("layout", WRITERS)
 @pytest.mark.parametrize("where", PLACES[:2])
-def test_cameras_keep_their_digits(where, layout, moving, tmp_path, monkeypatch):
+def test_world_offset_keeps_digits_of_cameras(where, layout, moving, tmp_path, monkeypatch):
     here = Scene.open(write(tmp_path / "here", layout, monkeypatch, moving=moving))
     there = Scene.open(write(tmp_path / "there", layout, monkeypatch, where, moving=moving))
     assert not here.world_offset.any() and there.world_offset.dtype == np.float64
@@ -58,7 +58,7 @@ def test_cameras_keep_their_digits(where, layout, moving, tmp_path, monkeypatch)
 
 
 @pytest.mark.parametrize("where", PLACES)
-def test_a_point_is_seen_where_it_is(where, tmp_path, monkeypatch):
+def test_world_offset_projects_points_exactly(where, tmp_path, monkeypatch):
     """In float32, too, which absolute coordinates would be pixels off in."""
     scene = Scene.open(write(tmp_path / "a", "transforms", monkeypatch, where))
     point = np.array([0.3, 0.2, 0.4])
@@ -70,14 +70,14 @@ def test_a_point_is_seen_where_it_is(where, tmp_path, monkeypatch):
     assert np.abs(expected - seen).max() < 1e-3
 
 
-def test_scenes_near_0_are_left_alone(tmp_path, monkeypatch):
+def test_world_offset_is_zero_near_the_origin(tmp_path, monkeypatch):
     for name, where in (("a", (0, 0, 0)), ("b", (10.0, 0, 0))):
         scene = Scene.open(write(tmp_path / name, "transforms", monkeypatch, where))
         assert not scene.world_offset.any()
         assert make_frames([scene], [[0, 1]], [[0]]).world_offset is None
 
 
-def test_the_unit_of_cameras_is_that_of_the_rig(tmp_path, monkeypatch):
+def test_world_offset_does_not_change_the_camera_unit(tmp_path, monkeypatch):
     """Not that of its distance from 0."""
     scene = Scene.open(write(tmp_path / "a", "genesis", monkeypatch, PLACES[0]), fitting=Fitting(unit_cameras=True))
     assert 0.2 < scene.near < 1.5
@@ -109,7 +109,7 @@ def world(particles):
     return particles.means.double() + (0 if particles.world_offset is None else particles.row_offset())
 
 
-def test_a_simulation_is_given_back_in_the_world(two, simulator, tmp_path):
+def test_simulate_writes_world_coordinates(two, simulator, tmp_path):
     _, (here, there) = two
     with torch.no_grad():
         a, b = (simulator.rollout(state, 2)[-1] for state in (here, there))
@@ -119,7 +119,7 @@ def test_a_simulation_is_given_back_in_the_world(two, simulator, tmp_path):
     torch.testing.assert_close(again.means.double() + again.world_offset, world(b), rtol=0, atol=1e-6)
 
 
-def test_edits_are_told_places_in_the_world(two, simulator):
+def test_edits_take_world_coordinates(two, simulator):
     _, states = two
     place = np.array([0.3, 0.4, 0.7])
     for operation in (
@@ -137,7 +137,7 @@ def test_edits_are_told_places_in_the_world(two, simulator):
         Move(Selection("all", ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)))).apply(states[1], simulator._colors)
 
 
-def test_what_is_inserted_keeps_its_place_in_the_world(two, simulator):
+def test_inserted_particles_keep_world_positions(two, simulator):
     _, (here, there) = two
     joined = Insert("all", here, PLACES[0]).apply(there, simulator._colors)
     n = there.n_rows
@@ -150,7 +150,7 @@ def test_what_is_inserted_keeps_its_place_in_the_world(two, simulator):
     torch.testing.assert_close(newest[half:], newest[:half], rtol=0, atol=1e-3)
 
 
-def test_scenes_of_a_batch_have_their_own(two, simulator):
+def test_world_offset_of_each_scene_of_a_batch(two, simulator):
     scenes, (here, there) = two
     frames = make_frames(scenes, [[0, 1, 2]] * 2, [[0, 1]] * 2)
     assert frames.world_offset.dtype == torch.float64 and not frames.world_offset[0].any()
@@ -164,7 +164,7 @@ def test_scenes_of_a_batch_have_their_own(two, simulator):
 
 
 @pytest.mark.parametrize("bad", [torch.zeros(2, 3), torch.zeros(1, 3, dtype=torch.float64), float("nan")])
-def test_offsets_that_are_none(bad, two, simulator):
+def test_unusable_world_offsets_are_refused(bad, two, simulator):
     scenes, _ = two
     frames = make_frames(scenes, [[0, 1, 2]] * 2, [[0, 1]] * 2)
     bad = torch.full((2, 3), bad, dtype=torch.float64) if isinstance(bad, float) else bad

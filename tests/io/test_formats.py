@@ -60,7 +60,7 @@ def partners(read, given):
 
 @pytest.mark.parametrize("degree", range(4))
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_what_is_read_is_within_the_bounds_of_what_was_written(suffix, degree, tmp_path):
+def test_formats_round_trip_within_their_bounds(suffix, degree, tmp_path):
     needs(suffix)
     position, angle, scale, opacity, constant, rest = BOUNDS[suffix]
     for count in COUNTS:
@@ -83,7 +83,7 @@ def test_what_is_read_is_within_the_bounds_of_what_was_written(suffix, degree, t
 
 
 @pytest.mark.parametrize("suffix", [suffix for suffix in WITHOUT_USD if suffix != ".glb"])
-def test_no_gaussians_are_none(suffix, tmp_path):
+def test_formats_hold_zero_gaussians(suffix, tmp_path):
     write_splats(tmp_path / f"none{suffix}", make(0, 1))
     assert read_splats(tmp_path / f"none{suffix}").means.shape == (0, 3)
 
@@ -150,7 +150,7 @@ def test_spz_of_version_4_is_read(degree, streams, tmp_path):
         read_splats(tmp_path / "four.spz")
 
 
-def test_a_splat_record_by_hand(tmp_path):
+def test_splat_record_by_hand(tmp_path):
     record = struct.pack("<6f", 1, 2, 3, 0.1, 0.2, 0.3) + bytes([255, 0, 51, 102]) + bytes([128, 255, 128, 128])
     (tmp_path / "one.splat").write_bytes(record)
     read = read_splats(tmp_path / "one.splat")
@@ -170,7 +170,7 @@ def test_foreign_readers_agree(tmp_path):
 
 
 @pytest.mark.parametrize("degree", range(4))
-def test_other_axes_show_the_same_scene(degree):
+def test_turned_splats_render_alike(degree):
     given = make(40, degree)
     splats = splats_of(given, None, "scene")
     other = turned(splats, Z_TO_Y_UP)
@@ -195,7 +195,7 @@ def picture(splats, viewmat):
 
 
 @pytest.mark.parametrize("suffix", WITHOUT_USD)
-def test_a_cut_off_file_is_refused_by_name(suffix, tmp_path):
+def test_truncated_files_are_refused_by_name(suffix, tmp_path):
     file = tmp_path / f"cut{suffix}"
     write_splats(file, make(3, 1))
     content = file.read_bytes()
@@ -220,7 +220,7 @@ def test_a_cut_off_file_is_refused_by_name(suffix, tmp_path):
     ],
     ids=["version", "count", "degree", "short", "short header", "not gzip", "not spz"],
 )
-def test_a_damaged_spz_is_refused(content, says, tmp_path):
+def test_damaged_spz_is_refused(content, says, tmp_path):
     (tmp_path / "bad.spz").write_bytes(content)
     with pytest.raises(InputError, match=says):
         read_splats(tmp_path / "bad.spz")
@@ -255,12 +255,12 @@ def edited_glb(tmp_path, change):
         (lambda d: d.update(meshes=7), "damaged"),
     ],
 )
-def test_a_damaged_glb_is_refused(change, says, tmp_path):
+def test_damaged_glb_is_refused(change, says, tmp_path):
     with pytest.raises(InputError, match=says):
         read_splats(edited_glb(tmp_path, change))
 
 
-def test_a_glb_stands_where_its_node_places_it(tmp_path):
+def test_glb_node_transform_is_applied(tmp_path):
     move = {"translation": [0, 5, 0], "scale": [2, 2, 2]}  # up in glTF's axes
     read = read_splats(edited_glb(tmp_path, lambda d: d["nodes"][0].update(move)))
     given = make(3, 0)
@@ -268,7 +268,7 @@ def test_a_glb_stands_where_its_node_places_it(tmp_path):
     torch.testing.assert_close(read.scales, 2 * given.scales)
 
 
-def test_a_compressed_ply_is_read_under_a_plain_name(tmp_path):
+def test_compressed_ply_is_recognised_by_content(tmp_path):
     write_splats(tmp_path / "a.compressed.ply", make(5, 0))
     (tmp_path / "a.compressed.ply").rename(tmp_path / "b.ply")
     assert read_splats(tmp_path / "b.ply").means.shape == (5, 3)
@@ -282,7 +282,7 @@ def moving(n_frames):
     return [dataclasses.replace(first, means=first.means + step * shift) for step in range(n_frames)]
 
 
-def test_usd_writes_what_is_still_once(tmp_path):
+def test_usd_stores_static_gaussians_once(tmp_path):
     pytest.importorskip("pxr", reason="usd-core is not installed")
     from pxr import Usd
 
@@ -299,7 +299,7 @@ def test_usd_writes_what_is_still_once(tmp_path):
     assert not prims["moving"].GetAttribute("opacities").GetTimeSamples()
 
 
-def test_a_sequence_has_the_rate_that_stands_beside_it(tmp_path):
+def test_sequence_reads_its_rate(tmp_path):
     folder = tmp_path / "run" / "gaussians"
     folder.mkdir(parents=True)
     for step, frame in enumerate(moving(3)):
@@ -316,13 +316,13 @@ def test_a_sequence_has_the_rate_that_stands_beside_it(tmp_path):
         open_sequence(folder)
 
 
-def test_an_orbit_shows_the_scene():
+def test_orbit_frames_show_the_scene():
     frames = list(orbit_frames(moving(3), 3, 64, 0.5))
     assert len(frames) == 3 and frames[0].shape == (64, 64, 3) and frames[0].dtype == np.uint8
     assert all((frame.max(2) > 20).mean() > 0.02 for frame in frames) and not np.array_equal(frames[0], frames[2])
 
 
-def test_the_command_exports_files_and_films(tmp_path, capsys):
+def test_export_command_writes_files_and_videos(tmp_path, capsys):
     folder = tmp_path / "gaussians"
     folder.mkdir()
     for step, frame in enumerate(moving(3)):
@@ -349,7 +349,7 @@ def test_the_command_exports_files_and_films(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz", ".glb"])
-def test_large_files_of_another_kind_are_not_read(suffix, tmp_path):
+def test_large_foreign_files_are_not_read(suffix, tmp_path):
     with open(tmp_path / f"a{suffix}", "wb") as file:
         file.truncate(2**30)
     tracemalloc.start()

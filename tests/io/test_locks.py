@@ -40,7 +40,7 @@ def other(tmp_path):
         process.stdin.close()
 
 
-def test_a_second_writer_gets_the_number_of_the_first(tmp_path, other):
+def test_second_writer_error_names_the_first(tmp_path, other):
     with pytest.raises(InputError, match=rf"process {other.pid} on .* is writing to {tmp_path / 'out'}; wait for it"):
         with only_one_writer(tmp_path / "out"):
             pass
@@ -53,7 +53,7 @@ def test_a_second_writer_gets_the_number_of_the_first(tmp_path, other):
     assert not (tmp_path / "out" / LOCK_FILE).exists() and not (tmp_path / LOCK_FILE).exists()
 
 
-def test_threads_and_links_lead_to_the_same_folder(tmp_path, other):
+def test_lock_covers_threads_and_links(tmp_path, other):
     (tmp_path / "link").symlink_to(tmp_path / "out")
     refused = []
 
@@ -70,7 +70,7 @@ def test_threads_and_links_lead_to_the_same_folder(tmp_path, other):
     assert len(refused) == 1 and f"process {other.pid} on" in refused[0]
 
 
-def test_commands_that_write_now_and_then_lock_their_folder(tmp_path, other, capsys):
+def test_commands_lock_their_folder(tmp_path, other, capsys):
     data, out = write_scenes(tmp_path / "data", 2), tmp_path / "out"
     (tmp_path / "train.yaml").write_text(yaml.safe_dump(to_dict(CONFIG)))
     assert main(["train", str(tmp_path / "train.yaml"), "--data", str(data), "--out", str(out)]) == 2
@@ -84,7 +84,7 @@ def test_commands_that_write_now_and_then_lock_their_folder(tmp_path, other, cap
     assert [path.name for path in out.iterdir()] == [LOCK_FILE]
 
 
-def test_a_run_is_locked_while_it_trains_and_leaves_nothing(tmp_path):
+def test_training_locks_its_run_and_leaves_no_file(tmp_path):
     trainer = Trainer(CONFIG, scenes(write_scenes(tmp_path / "data", 2)), tmp_path / "run")
     step, found = trainer.train_step, []
 

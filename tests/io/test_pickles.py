@@ -29,7 +29,7 @@ USES = {
 
 @pytest.mark.parametrize("use", USES)
 @pytest.mark.parametrize("bomb", BOMBS)
-def test_tuples_that_hold_each_other_are_refused(tmp_path, bomb, use):
+def test_check_pickle_refuses_nested_tuples(tmp_path, bomb, use):
     data = USES[use](BOMBS[bomb])
     with zipfile.ZipFile(tmp_path / "m.ckpt", "w") as archive:
         archive.writestr("archive/data.pkl", data)
@@ -39,7 +39,7 @@ def test_tuples_that_hold_each_other_are_refused(tmp_path, bomb, use):
         assert len(str(error.value)) < 200 + len(str(tmp_path))
 
 
-def test_long_pickles_and_far_indices_are_refused(monkeypatch):
+def test_check_pickle_refuses_long_pickles_and_far_indices(monkeypatch):
     with pytest.raises(ValueError, match="index of its memo"):
         pickles.check_pickle(b"K\x01r\xff\xff\xff\x7f.")
     monkeypatch.setattr(pickles, "MAX_OPS", 1000)
@@ -48,7 +48,7 @@ def test_long_pickles_and_far_indices_are_refused(monkeypatch):
 
 
 @pytest.mark.parametrize("protocol", range(6))
-def test_what_is_harmless_passes(protocol):
+def test_check_pickle_passes_harmless_values(protocol):
     shared = (1, 2)
     table = {"c": (torch.Size([3]), frozenset({1}), b"x", None, 1.5)}
     content = {"a": [shared] * 1000, ("b", shared): table, 3: [[[]]]}

@@ -32,7 +32,7 @@ def gaussians(n=7, degree=3, seed=0):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_spec(tmp_path, degree):
+def test_write_ply_round_trip(tmp_path, degree):
     before = gaussians(degree=degree)
     write_ply(tmp_path / "a.ply", before)
     after = read_ply(tmp_path / "a.ply")
@@ -43,13 +43,13 @@ def test_spec(tmp_path, degree):
     assert after.cu_rows.tolist() == [0, 7]
 
 
-def test_one_cloud_is_selected(tmp_path):
+def test_write_ply_selects_a_cloud(tmp_path):
     before = gaussians()
     write_ply(tmp_path / "a.ply", before, cloud=1)
     torch.testing.assert_close(read_ply(tmp_path / "a.ply").means, before.means[3:])
 
 
-def test_the_layout_that_viewers_expect(tmp_path):
+def test_write_ply_layout_of_viewers(tmp_path):
     before = gaussians(degree=1)
     write_ply(tmp_path / "a.ply", before)
     loaded = trimesh.load(tmp_path / "a.ply", process=False)
@@ -67,7 +67,7 @@ def test_the_layout_that_viewers_expect(tmp_path):
     assert np.allclose(np.ravel(table["rot_0"]), before.quats[:, 0].numpy())
 
 
-def test_extreme_values_stay_finite(tmp_path):
+def test_write_ply_clamps_extreme_values(tmp_path):
     before = gaussians()
     before.scales[0] = 0.0
     before.opacities[0], before.opacities[1] = 0.0, 1.0
@@ -77,12 +77,12 @@ def test_extreme_values_stay_finite(tmp_path):
     assert after.scales[0].max() < 1e-8
 
 
-def test_no_gaussians(tmp_path):
+def test_ply_of_no_gaussians(tmp_path):
     write_ply(tmp_path / "a.ply", gaussians(0))
     assert read_ply(tmp_path / "a.ply").means.shape == (0, 3)
 
 
-def test_text_and_other_orders_are_read(tmp_path):
+def test_read_ply_text_in_any_order(tmp_path):
     names = "opacity x y z scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3 f_dc_0 f_dc_1 f_dc_2 extra".split()
     header = ["ply", "format ascii 1.0", "comment text", "element vertex 1", *(f"property float {n}" for n in names)]
     (tmp_path / "a.ply").write_text("\n".join([*header, "end_header", "0 1 2 3 -1 -1 -1 2 0 0 0 0.1 0.2 0.3 9", ""]))
@@ -98,7 +98,7 @@ def broken_files(good: bytes):
     yield "list", good.replace(b"property float nx", b"property list uchar int nx"), "truncated"
 
 
-def test_broken_files_are_refused(tmp_path):
+def test_read_ply_refuses_broken_files(tmp_path):
     write_ply(tmp_path / "good.ply", gaussians(degree=1))
     for what, content, message in broken_files((tmp_path / "good.ply").read_bytes()):
         (tmp_path / "bad.ply").write_bytes(content)
@@ -109,7 +109,7 @@ def test_broken_files_are_refused(tmp_path):
         read_ply(tmp_path / "missing.ply")
 
 
-def test_values_that_are_not_finite_are_not_written(tmp_path):
+def test_write_ply_refuses_values_that_are_not_finite(tmp_path):
     before = gaussians()
     before.means[2, 1] = float("nan")
     with pytest.raises(InputError, match="means"):
@@ -155,7 +155,7 @@ def read(folder, content):
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_two_scales_are_flat_gaussians(form, tmp_path):
+def test_read_ply_of_2dgs(form, tmp_path):
     flat = [p for p in REST if p[1] != "scale_2"]
     row = [1, 2, 3, 0.1, 0.2, 0.3, 0.0, -1.0, -2.0, 1.0, 0.0, 0.0, 0.0]
     got = read(tmp_path, rows_of(XYZ + DC + flat, [row], form))
@@ -173,13 +173,13 @@ def test_two_scales_are_flat_gaussians(form, tmp_path):
         ("float", ("r", "g", "b"), (1.0, 0.0, 0.2), (1, 0, 0.2)),
     ],
 )
-def test_colours_without_harmonics(kind, names, values, colors, form, tmp_path):
+def test_read_ply_colours_without_harmonics(kind, names, values, colors, form, tmp_path):
     properties = XYZ + [(kind, name) for name in names] + REST
     got = read(tmp_path, rows_of(properties, [[1, 2, 3, *values, *SHAPE]], form))
     assert (got.sh[0, 0] * SH_0 + 0.5).tolist() == pytest.approx(colors, abs=1e-6)
 
 
-def test_colours_beside_harmonics_are_not_read(tmp_path):
+def test_read_ply_prefers_harmonics_to_colours(tmp_path):
     properties = XYZ + DC + [("uchar", name) for name in ("red", "green", "blue")] + REST
     got = read(tmp_path, rows_of(properties, [[1, 2, 3, 0.1, 0.2, 0.3, 255, 0, 0, *SHAPE]]))
     assert got.sh[0, 0].tolist() == pytest.approx([0.1, 0.2, 0.3])
@@ -188,7 +188,7 @@ def test_colours_beside_harmonics_are_not_read(tmp_path):
         read(tmp_path, rows_of(properties, [[1, 2, 3, 255.0, 0.0, 0.0, *SHAPE]]))
 
 
-def test_degree_4_is_dropped_with_a_word(tmp_path):
+def test_read_ply_warns_of_degree_4(tmp_path):
     rest = [("float", f"f_rest_{i}") for i in range(72)]
     content = rows_of(XYZ + DC + rest + REST, [[1, 2, 3, 9, 9, 9, *range(72), *SHAPE]])
     with pytest.warns(UserWarning, match="degree 4 are dropped"):
@@ -199,7 +199,7 @@ def test_degree_4_is_dropped_with_a_word(tmp_path):
 
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("lists", [[[7, 8], [9, 10]], [[7], [8, 9, 10]], [[], []]])
-def test_lists_and_further_elements(lists, form, tmp_path):
+def test_read_ply_with_lists_and_other_elements(lists, form, tmp_path):
     properties = [*XYZ, ("uchar", "int", "tags"), *DC, *REST]
     rows = [[i, 2, 3, tags, 0.1, 0.2, 0.3, *SHAPE] for i, tags in enumerate(lists)]
     before = [("camera", [("float", "f"), ("uchar", "double", "matrix")], [[1.0, [0.5] * len(tags)] for tags in lists])]
@@ -231,13 +231,13 @@ def test_lists_and_further_elements(lists, form, tmp_path):
         ),
     ],
 )
-def test_what_is_no_file_of_gaussians(content, message, tmp_path):
+def test_read_ply_refuses_other_files(content, message, tmp_path):
     with pytest.raises(InputError, match=message) as caught:
         read(tmp_path, content)
     assert len(str(caught.value)) < 400 and "\n" not in str(caught.value)
 
 
-def test_rows_with_lists_are_read_up_to_a_bound(tmp_path, monkeypatch):
+def test_read_ply_bounds_rows_with_lists(tmp_path, monkeypatch):
     monkeypatch.setattr("gsim3d.io.ply_format.MAX_LIST_ROWS", 3)
     faces = [[[0] * (1 + i % 2)] for i in range(4)]
     content = rows_of(XYZ + DC + REST, [[1, 2, 3, 0, 0, 0, *SHAPE]], before=[("face", [("uchar", "int", "v")], faces)])
@@ -253,18 +253,18 @@ def test_rows_with_lists_are_read_up_to_a_bound(tmp_path, monkeypatch):
         ([], ("splatrendermode:mip-splatting",)),
     ],
 )
-def test_antialiased_training_is_said(properties, comments, tmp_path):
+def test_read_ply_warns_of_antialiased_training(properties, comments, tmp_path):
     row = [1, 2, 3, 0, 0, 0, *SHAPE, *([0.5] * len(properties))]
     with pytest.warns(UserWarning, match="trained with antialiasing"):
         read(tmp_path, rows_of(XYZ + DC + REST + properties, [row], comments=comments))
 
 
-def test_no_warning_without_a_reason(tmp_path, recwarn):
+def test_read_ply_does_not_warn_otherwise(tmp_path, recwarn):
     read(tmp_path, rows_of(XYZ + DC + REST, [[1, 2, 3, 0, 0, 0, *SHAPE]], comments=("SplatRenderMode: default",)))
     assert not recwarn.list
 
 
-def test_gaussians_without_colours_are_not_written(tmp_path):
+def test_write_ply_refuses_gaussians_without_colours(tmp_path):
     with pytest.raises(InputError, match="sh is None"):
         write_ply(tmp_path / "a.ply", dataclasses.replace(gaussians(), sh=None))
     assert list(tmp_path.iterdir()) == []
@@ -275,7 +275,7 @@ PLACES = [(500000.25, 4649776.5, 100.125), (-1e7, 3.5, 0.0), (12345.678, -2.0, 8
 
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("place", PLACES)
-def test_positions_of_surveys_keep_their_digits(place, form, tmp_path):
+def test_ply_survey_positions_keep_their_digits(place, form, tmp_path):
     world = np.array(place) + np.array([[0.0, 0.001, 0.002], [3.0, -2.0, 1.25], [-1.0, 0.1, 0.0]])
     properties = [("double", name) for name in "xyz"] + DC + REST
     got = read(tmp_path, rows_of(properties, [[*p, 0.1, 0.2, 0.3, *SHAPE] for p in world.tolist()], form))
@@ -288,13 +288,13 @@ def test_positions_of_surveys_keep_their_digits(place, form, tmp_path):
     assert table.dtype["x"] == np.float64 and table.dtype["opacity"] == np.float32
 
 
-def test_positions_that_float32_holds_have_no_offset(tmp_path):
+def test_read_ply_offset_is_none_near_the_origin(tmp_path):
     for kind, place in (("double", (1.5, 2.5, 1e6)), ("float", (5e5, 4649776.0, 1.0)), ("double", (0.1, 0.2, 0.3))):
         got = read(tmp_path, rows_of([(kind, n) for n in "xyz"] + DC + REST, [[*place, 0, 0, 0, *SHAPE]]))
         assert got.world_offset is None and got.means[0].tolist() == pytest.approx(place)
 
 
-def test_clouds_are_written_with_their_own_offsets(tmp_path):
+def test_write_ply_applies_offsets_of_clouds(tmp_path):
     offsets = torch.tensor([[1e6, 0, 0], [0, 2e6, 0]], dtype=torch.float64)
     before = dataclasses.replace(gaussians(), world_offset=offsets)
     for cloud in (0, 1):
@@ -305,7 +305,7 @@ def test_clouds_are_written_with_their_own_offsets(tmp_path):
         torch.testing.assert_close(after.means.double() + after.world_offset, expected, rtol=0, atol=1e-6)
 
 
-def test_large_files_that_are_no_ply_are_not_read(tmp_path):
+def test_read_ply_leaves_large_foreign_files_unread(tmp_path):
     with open(tmp_path / "a.ply", "wb") as file:
         file.truncate(2**30)
     tracemalloc.start()

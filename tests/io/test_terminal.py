@@ -27,7 +27,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_what_is_printed_holds_no_control_characters(name):
+def test_plain_escapes_control_characters(name):
     stream = io.StringIO()
     print(f"scene {CASES[name]}/0000\n\tnext", file=Terminal(stream))
     text = stream.getvalue()
@@ -35,7 +35,7 @@ def test_what_is_printed_holds_no_control_characters(name):
     assert all(letter in "\n\t" or (letter.isprintable() and not "\ud800" <= letter <= "\udfff") for letter in text)
 
 
-def test_ordinary_text_and_bars_pass():
+def test_terminal_passes_text_and_bars():
     for text in ("Ärger 猫 – ½\n", "\r 50%|█████     |"):
         stream = io.StringIO()
         Terminal(stream).write(text)
@@ -66,7 +66,7 @@ HOSTILE = "a\x1b]0;pwned\x07\x1b[2J\udcff.png"
         [HOSTILE],
     ],
 )
-def test_names_of_files_do_not_steer_the_terminal(tmp_path, capsys, monkeypatch, arguments):
+def test_commands_escape_file_names(tmp_path, capsys, monkeypatch, arguments):
     monkeypatch.chdir(tmp_path)
     scene = tmp_path / "x"
     scene.mkdir()
@@ -80,7 +80,7 @@ def test_names_of_files_do_not_steer_the_terminal(tmp_path, capsys, monkeypatch,
     assert "Traceback" not in text
 
 
-def test_progress_is_for_terminals(capsys, monkeypatch):
+def test_progress_is_hidden_without_terminal(capsys, monkeypatch):
     for terminal, quiet in ((True, False), (True, True), (False, False)):
         monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
         assert list(progress(range(2), "scenes", unit="scene", quiet=quiet)) == [0, 1]
@@ -115,7 +115,7 @@ def test_progress_is_for_terminals(capsys, monkeypatch):
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
-def test_near_words_are_suggested(tmp_path, capsys, arguments, message):
+def test_commands_suggest_near_words(tmp_path, capsys, arguments, message):
     (tmp_path / "config.yaml").write_text("optimizer: {weight_decy: 1}")
     (tmp_path / "effects.yaml").write_text("dynamics: {histroy: 1}")
     places = {name: tmp_path / f"{name}.yaml" for name in ("config", "effects")} | {"new": tmp_path / "new"}
@@ -126,7 +126,7 @@ def test_near_words_are_suggested(tmp_path, capsys, arguments, message):
     assert err.count("\n") == 1 and re.search(re.sub(r"([?()])", r"\\\1", message), err), err
 
 
-def test_words_that_are_far_get_no_hint():
+def test_did_you_mean_ignores_distant_words():
     assert did_you_mean("xyzzy", ["train", "plan"]) == "" and did_you_mean(None, ["plan"]) == ""
     assert did_you_mean("TRAIN", ["train", "plan"]) == "; did you mean train?"
     assert did_you_mean("a" * 10**6, ["train"]) == ""
@@ -134,7 +134,7 @@ def test_words_that_are_far_get_no_hint():
         model_config(TrainConfig(preset="tinny"))
 
 
-def test_no_option_may_be_abbreviated(capsys):
+def test_commands_refuse_abbreviated_options(capsys):
     for name, (module, _) in COMMANDS.items():
         parser = Parser(prog=name)
         command_line.importlib.import_module(module).add_arguments(parser)
@@ -170,7 +170,7 @@ def test_no_option_may_be_abbreviated(capsys):
         ("doctor --stability", "--steps", ["0"]),
     ],
 )
-def test_options_are_checked_before_anything_is_read(tmp_path, monkeypatch, capsys, command, option, values):
+def test_commands_check_options_before_reading(tmp_path, monkeypatch, capsys, command, option, values):
     monkeypatch.chdir(tmp_path)
     for value in values:
         assert main([*command.split(), option, *value.split()]) == 2
@@ -179,11 +179,11 @@ def test_options_are_checked_before_anything_is_read(tmp_path, monkeypatch, caps
     assert not list(tmp_path.iterdir())
 
 
-def test_ranges():
+def test_number_ranges():
     assert whole(2, 4)("4") == 4 and number(0, above=True)("1e-3") == 1e-3 and number(0)("0") == 0
 
 
-def test_folders_around_what_is_written_are_made_and_files_are_no_folders(tmp_path):
+def test_output_path_makes_folders_and_refuses_files(tmp_path):
     assert with_parents(new_output_path(tmp_path / "a" / "b" / "c")).parent.is_dir()
     with pytest.raises(InputError, match="--out: .* exists already; name another folder"):
         new_output_path(tmp_path / "a")
@@ -201,7 +201,7 @@ def test_folders_around_what_is_written_are_made_and_files_are_no_folders(tmp_pa
         output_path(tmp_path / "a.jpg", ".png", "--export")
 
 
-def test_values_of_files_are_shown_in_few_letters():
+def test_shown_is_short():
     bomb = ["x"]
     for _ in range(60):
         bomb = [bomb] * 9
@@ -219,7 +219,7 @@ def limited(tmp_path, size, *arguments):
     return subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment, check=False)
 
 
-def test_a_full_disk_is_named_with_the_place(tmp_path, capsys, monkeypatch):
+def test_full_disk_error_names_the_path(tmp_path, capsys, monkeypatch):
     def full(args):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -232,13 +232,13 @@ def test_a_full_disk_is_named_with_the_place(tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("processes", [1, 2])
-def test_a_full_disk_while_scenes_are_made(tmp_path, processes):
+def test_full_disk_error_of_generate(tmp_path, processes):
     made = ["generate", "elastic", "--size", "16", "--frames", "2", "--trajectories", "2", "--out", "made", "--quiet"]
     done = limited(tmp_path, 50, *made, "--processes", processes)
     assert done.returncode == 2 and done.stderr == "gsim3d: error: made: File too large\n"
 
 
-def test_a_text_appears_whole_or_not_at_all(tmp_path, monkeypatch):
+def test_write_whole_is_atomic(tmp_path, monkeypatch):
     write_whole(tmp_path / "a.txt", "before \udcff")
     assert (tmp_path / "a.txt").read_text() == "before \\udcff"
 
@@ -253,7 +253,7 @@ def test_a_text_appears_whole_or_not_at_all(tmp_path, monkeypatch):
     assert (tmp_path / "a.txt").read_text().startswith("before")
 
 
-def test_a_closed_pipe_is_no_error(tmp_path):
+def test_closed_pipe_is_no_error(tmp_path):
     command = f"{sys.executable} -m gsim3d {{}} | true; echo ${{{{PIPESTATUS[0]}}}}"
     environment = {**os.environ, "PYTHONPATH": os.getcwd()}
     for words in ("--help", "train --print-config", "generate --help"):

@@ -15,7 +15,7 @@ def moving_square(n, height=64, width=96):
     return frames
 
 
-def test_codec_frames_rate_and_colours(tmp_path):
+def test_write_video_codec_frames_rate_and_colours(tmp_path):
     frames = moving_square(10)
     write_video(tmp_path / "a.mp4", frames, fps=12)
     assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
@@ -44,13 +44,13 @@ def test_codec_frames_rate_and_colours(tmp_path):
         ("missing/a.mp4", moving_square(2), 12, "cannot write"),
     ],
 )
-def test_bad_input_leaves_nothing_behind(tmp_path, name, frames, fps, message):
+def test_write_video_refuses_bad_input(tmp_path, name, frames, fps, message):
     with pytest.raises(InputError, match=message):
         write_video(tmp_path / name, frames, fps)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_video_that_is_cut_off_is_an_error(tmp_path, monkeypatch):
+def test_write_video_detects_truncation(tmp_path, monkeypatch):
     """A full disk ends the file before its index, and the writer of OpenCV says nothing."""
 
     class Full:

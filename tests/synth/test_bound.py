@@ -26,7 +26,7 @@ def sets(tmp_path_factory):
 
 
 @pytest.mark.parametrize("world", WORLDS)
-def test_a_set_simulated_again_without_errors_is_itself(sets, world, monkeypatch):
+def test_bound_without_errors_reproduces_the_set(sets, world, monkeypatch):
     monkeypatch.setitem(module.ERRORS, world, StartErrors(0.0))
     summary = bound(sets / world, **ONE)
     assert summary["n_scenes"] == 2 and summary["n_future_steps"] == SMALL["n_frames"] - GIVEN
@@ -36,7 +36,7 @@ def test_a_set_simulated_again_without_errors_is_itself(sets, world, monkeypatch
 
 
 @pytest.mark.parametrize("world", WORLDS)
-def test_errors_have_their_lengths_at_the_last_given_step(world):
+def test_start_errors_have_their_lengths_at_the_last_given_step(world):
     """Before it and after it bodies fly: places differ by the error of place and that of velocity for each step."""
     settings = build_world(world, "published", {**SMALL, "drop_height": (0.9, 0.9), "fps": 42.0})
     drawn, errors = settings.draw("box", 0, 0), ERRORS[world]
@@ -61,7 +61,7 @@ def test_errors_have_their_lengths_at_the_last_given_step(world):
         np.testing.assert_allclose(turned(6), errors.spin * spin * (6 - last) / settings.fps, rtol=0.2, atol=3e-5)
 
 
-def test_sums_of_errors_and_their_standard_errors():
+def test_bound_summary_means_and_standard_errors():
     errors = np.full((module.SAMPLES + 1, 3, 2, 2), 1e-3)
     errors[-1] = 1e-4
     errors[:, 0, 0, 1] = np.nan  # an image without bodies
@@ -77,7 +77,7 @@ def test_sums_of_errors_and_their_standard_errors():
     assert summary["scenes"]["a/0001"]["one"]["psnr_masked"] == 20.0
 
 
-def test_the_command_goes_on_and_adds_what_a_model_misses(sets, tmp_path, capsys):
+def test_bound_command_continues_and_adds_given_errors(sets, tmp_path, capsys):
     scores = tmp_path / "metrics.json"
     scores.write_text(json.dumps({"past.psnr_masked": 30.0, "past.psnr_body": 22.0, "past.ssim": None}))
     arguments = ["bound", str(sets / "rigid"), "--out", str(tmp_path / "out"), "--processes", "1", "--quiet"]
@@ -94,7 +94,7 @@ def test_the_command_goes_on_and_adds_what_a_model_misses(sets, tmp_path, capsys
         bound(sets / "elastic", out=tmp_path / "out", **ONE)
 
 
-def test_what_cannot_be_simulated_again_is_refused(sets, tmp_path):
+def test_bound_refuses_other_sets(sets, tmp_path):
     with pytest.raises(InputError, match="manifest.json does not exist"):
         bound(tmp_path, **ONE)
     settings = json.loads((sets / "elastic" / "manifest.json").read_text())["settings"]

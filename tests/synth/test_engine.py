@@ -50,7 +50,7 @@ def motion(ball):
     return lattice, vertices
 
 
-def test_free_fall(motion):
+def test_soft_body_in_free_fall(motion):
     _, vertices = motion
     time = np.arange(8) / FPS
     fallen = vertices[0].mean(0) - vertices[:8].mean(1)
@@ -58,13 +58,13 @@ def test_free_fall(motion):
     np.testing.assert_allclose(fallen[:, :2], 0, atol=1e-6)
 
 
-def test_without_ground_a_body_falls_for_ever(ball):
+def test_body_without_ground_keeps_falling(ball):
     (vertices,), _ = move([ball], 16, ground=None)
     fallen = vertices[0].mean(0) - vertices[-1].mean(0)
     np.testing.assert_allclose(fallen, [0, 0, 9.81 * (15 / FPS) ** 2 / 2], atol=2e-2)
 
 
-def test_the_body_lands_is_squeezed_and_jumps_back(motion):
+def test_soft_body_lands_deforms_and_bounces(motion):
     _, vertices = motion
     lowest, height = vertices[..., 2].min(1), np.ptp(vertices[..., 2], axis=1)
     assert lowest.min() > -0.03  # centimetres into the ground at impact, a pixel at most
@@ -75,7 +75,7 @@ def test_the_body_lands_is_squeezed_and_jumps_back(motion):
     assert wide > 1.02 * np.ptp(vertices[0, :, 0])
 
 
-def test_a_raised_ground_moves_everything_up(motion, ball):
+def test_raised_ground_shifts_the_motion(motion, ball):
     drawn, body = ball
     raised = dataclasses.replace(body, vertices=body.vertices + [0, 0, 0.25])
     (vertices,), _ = move([(drawn + [0, 0, 0.25], raised)], 16, ground=0.25)
@@ -98,7 +98,7 @@ def test_materials_bounce_and_keep_dents_as_named():
 
 
 @pytest.mark.parametrize("name", ["ball", "torus"])
-def test_energy_does_not_grow(name):
+def test_check_energy_bounds_gains(name):
     """Height and speed of the centre never need more than the start had, in every frame, for soft and rigid bodies."""
     spin = np.array([2.0, -1.0, 0.5])
     for cast in ([soft(name, 0.9)], [rigid(name, 0.9, bounce=0.7, velocity=[0.5, 0, 0.6], spin=spin)]):
@@ -126,7 +126,7 @@ def test_rigid_bodies_keep_their_shape_and_stay_above_the_ground():
         assert np.abs(frame.nodes[-1] - frame.nodes[0]).max() > 0.1
 
 
-def test_rigid_bodies_bounce_as_asked():
+def test_rigid_bounce_follows_the_coefficient():
     jump = []
     for bounce in (0.1, 0.4, 0.7):
         (vertices,), _ = move([rigid("ball", 1.0, bounce=bounce)], 40, fps=42.0, max_timestep=1 / 960)
@@ -136,7 +136,7 @@ def test_rigid_bodies_bounce_as_asked():
     assert jump[2] > 1.5 * jump[1] > 1.5 * 1.5 * jump[0]
 
 
-def test_thrown_body_flies_a_parabola_about_its_centre_of_mass():
+def test_thrown_rigid_body_follows_a_parabola():
     velocity, spin = np.array([1.0, -0.5, 2.0]), np.array([0.0, 4.0, 1.0])
     (vertices,), _ = move([rigid("box", 1.0, velocity=velocity, spin=spin)], 8, ground=None, max_timestep=1 / 960)
     time = np.arange(8)[:, None] / FPS
@@ -151,7 +151,7 @@ def _rotation(before, after):
     return v.T @ np.diag([1, 1, np.linalg.det(v.T @ u.T)]) @ u.T
 
 
-def test_bodies_do_not_pass_through_each_other():
+def test_rigid_bodies_do_not_interpenetrate():
     pairs = [[soft("ball", z, size=0.5, mass=5.0) for z in (0.3, 1.0)], [rigid("ball", z) for z in (0.3, 1.0)]]
     for cast in pairs:
         moved, _ = move(cast, 24, fps=42.0)
@@ -167,7 +167,7 @@ def on_cloth():
     return moved, carried[-1], cloth
 
 
-def test_a_body_rests_on_cloth_that_hangs_from_its_corners(on_cloth):
+def test_cloth_carries_a_body(on_cloth):
     (body,), sheet, cloth = on_cloth
     corners = sheet.nodes[:, [0, 0, -1, -1], [0, -1, 0, -1]]
     np.testing.assert_allclose(corners, np.broadcast_to(corners[0], corners.shape), atol=1e-6)
@@ -182,7 +182,7 @@ def test_a_body_rests_on_cloth_that_hangs_from_its_corners(on_cloth):
         scene_setup.check_cloth([body], fine - [0, 0, 0.8], 0.0)
 
 
-def test_cloth_is_drawn_through_its_nodes(on_cloth):
+def test_refined_cloth_passes_through_its_nodes(on_cloth):
     _, sheet, _ = on_cloth
     nodes = sheet.nodes[-1]
     fine = sheet.refine(3).move(nodes).reshape(37, 37, 3)
@@ -192,11 +192,11 @@ def test_cloth_is_drawn_through_its_nodes(on_cloth):
     np.testing.assert_allclose(np.diff(flat, 2, axis=0), 0, atol=1e-12)  # straight lines stay straight, borders too
 
 
-def test_points_equal_the_mesh_at_rest(motion, ball):
+def test_bound_points_equal_the_mesh_at_rest(motion, ball):
     np.testing.assert_allclose(motion[1][0], ball[0], atol=TOLERANCES["generate_binding"].value)
 
 
-def test_rigid_motion_of_the_nodes_moves_points_rigidly(motion, ball):
+def test_bindings_reproduce_rigid_motions(motion, ball):
     points = np.concatenate([ball[0], ball[0] * 1.3 - 0.2])  # also outside the lattice
     particles = np.random.default_rng(0).normal(0, 0.2, (1, 300, 3)) + [0, 0, 0.95]
     axes = np.concatenate([np.zeros((1, 3)), np.eye(3)])[None]
@@ -210,7 +210,7 @@ def test_rigid_motion_of_the_nodes_moves_points_rigidly(motion, ball):
 
 
 @pytest.mark.parametrize("cells", [1, 3, 4])
-def test_points_follow_the_simulated_mesh(ball, cells):
+def test_bound_points_follow_the_simulated_mesh(ball, cells):
     """The collision mesh, bound like any other points, is where MuJoCo has it.
 
     With 4 cells some corners of the box hold nothing: their nodes are welded to the world or drift freely.
@@ -229,7 +229,7 @@ def test_points_follow_the_simulated_mesh(ball, cells):
     assert nearest.max() < 1e-5
 
 
-def test_points_are_bound_to_occupied_cells_only():
+def test_control_grid_binds_to_occupied_cells_only():
     rest = np.stack(np.meshgrid(*[np.linspace(0, 1, 4)] * 3, indexing="ij"), -1)
     occupied = np.zeros((3, 3, 3), dtype=bool)
     occupied[1, 1, 1] = True
@@ -239,11 +239,11 @@ def test_points_are_bound_to_occupied_cells_only():
     assert set(np.unique(binding.corners)) == {(x * 4 + y) * 4 + z for x in (1, 2) for y in (1, 2) for z in (1, 2)}
 
 
-def test_the_same_bits_twice(motion, ball):
+def test_simulation_repeats_bit_by_bit(motion, ball):
     assert np.array_equal(motion[0].nodes, move([ball], 16)[1][0].nodes)
 
 
-def test_start_velocity_and_spin(ball):
+def test_simulation_starts_with_velocity_and_spin(ball):
     velocity, spin = np.array([0.3, -0.2, 0.0]), np.array([0.0, 0.0, 1.0])
     body = dataclasses.replace(ball[1], velocity=velocity, spin=spin)
     (moved,), _ = move([(body.vertices, body)], 3)
@@ -265,7 +265,7 @@ def test_start_velocity_and_spin(ball):
         (lambda v: v - [0, 0, 2.0], "sank"),
     ],
 )
-def test_motion_that_is_no_motion(motion, spoil, message):
+def test_check_motion_rejects_broken_bodies(motion, spoil, message):
     scene_setup.check_motion(motion[1], 0.0)
     with pytest.raises(scene_setup.Unstable, match=message):
         scene_setup.check_motion(spoil(motion[1]), 0.0)

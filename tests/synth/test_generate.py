@@ -55,7 +55,7 @@ def made(tmp_path_factory):
     return out, generate(out, processes=1, progress=False, **SMALL)
 
 
-def test_layout(made):
+def test_generated_folder_layout(made):
     out, report = made
     names = [folder.relative_to(out).as_posix() for folder in report.folders]
     assert names == ["ball/0000", "ball/0001", "torus/0000"] and report.n_made == 3
@@ -64,7 +64,7 @@ def test_layout(made):
     assert find_scenes(out) == report.folders
 
 
-def test_the_reader_reads_it(made):
+def test_generated_scenes_are_read_by_scene(made):
     out, report = made
     scene = Scene.open(report.folders[0])
     assert (scene.n_steps, scene.n_cams, scene.width, scene.height) == (4, 3, 32, 32)
@@ -79,7 +79,7 @@ def test_the_reader_reads_it(made):
     assert (frames.images.permute(0, 2, 3, 1)[~frames.masks].mean() < 0.1).all()
 
 
-def test_states_and_labels_agree(made):
+def test_generated_states_agree_with_labels(made):
     """The box of the body's control lattice, projected, holds the body's pixels and is not much larger."""
     for folder in made[1].folders:
         scene = Scene.open(folder)
@@ -97,7 +97,7 @@ def test_states_and_labels_agree(made):
             assert (high - low < 1.8 * np.array([np.ptp(x) + 1, np.ptp(y) + 1]) + 2).all()
 
 
-def test_each_world_ships_the_spec_that_it_calls_for(made):
+def test_generated_effects_spec_of_each_world(made):
     out, report = made
     spec = EffectsSpec.of_scene(report.folders[0])
     assert spec == EffectsSpec.load(out / "effects.yaml") == build_world("elastic", "mini", {}).effects()
@@ -111,7 +111,7 @@ def test_each_world_ships_the_spec_that_it_calls_for(made):
             assert plan.history == 2 and ("background" in plan.on) == settings.ground
 
 
-def test_manifest(made):
+def test_generated_manifest(made):
     out, report = made
     manifest = json.loads((out / "manifest.json").read_text())
     assert manifest["settings"]["image_size"] == 32 and manifest["settings"]["world"] == "elastic"
@@ -133,7 +133,7 @@ def test_manifest(made):
         assert entry["images_sha256"] == digest.hexdigest()
 
 
-def test_the_same_bytes_for_two_processes_and_after_a_kill(made, tmp_path):
+def test_generate_is_independent_of_processes_and_kills(made, tmp_path):
     out, _ = made
     again = tmp_path / "again"
     half = again / "ball" / ".0001.unfinished" / "cam_0"
@@ -144,7 +144,7 @@ def test_the_same_bytes_for_two_processes_and_after_a_kill(made, tmp_path):
     assert tree_hash(again) == tree_hash(out)
 
 
-def test_finished_scenes_are_kept_and_more_can_be_added(made, tmp_path):
+def test_generate_keeps_finished_scenes_and_adds_more(made, tmp_path):
     out = tmp_path / "copy"
     shutil.copytree(made[0], out)
     before = {file: file.stat().st_mtime_ns for file in out.rglob("*.png")}
@@ -156,12 +156,12 @@ def test_finished_scenes_are_kept_and_more_can_be_added(made, tmp_path):
     assert tree_hash(out / "torus" / "0000") == tree_hash(made[0] / "torus" / "0000")
 
 
-def test_other_options_do_not_mix(made):
+def test_generate_refuses_to_mix_options(made):
     with pytest.raises(InputError, match="made with other options"):
         generate(made[0], processes=1, progress=False, **{**SMALL, "seed": 1})
 
 
-def test_another_seed_gives_another_scene(made, tmp_path):
+def test_generate_depends_on_the_seed(made, tmp_path):
     changes = {**SMALL, "n_trajectories": 1, "seed": 1}
     generate(tmp_path, processes=1, progress=False, **changes)
     ours, theirs = (np.load(out / "ball/0000/states.npz")["body_0"] for out in (tmp_path, made[0]))
@@ -169,7 +169,7 @@ def test_another_seed_gives_another_scene(made, tmp_path):
 
 
 @pytest.mark.slow
-def test_killed_and_resumed(tmp_path):
+def test_generate_resumes_after_a_kill(tmp_path):
     """A run whose every process may be killed at any moment goes on to the same bytes."""
     changes = {**SMALL, "n_trajectories": 6, "n_frames": 12}
     generate(tmp_path / "whole", processes=1, progress=False, **changes)
@@ -203,7 +203,7 @@ def mini_scenes():
     return world, [world.make(name, 0) for name in ("ball", "box", "torus")]
 
 
-def test_bodies_fall_their_height_and_deform(mini_scenes):
+def test_elastic_bodies_fall_and_deform(mini_scenes):
     world, scenes = mini_scenes
     assert world.n_frames / world.fps >= 0.9
     for scene in scenes:
@@ -217,7 +217,7 @@ def test_bodies_fall_their_height_and_deform(mini_scenes):
     assert (np.ptp(middle, axis=-1).mean((1, 2)) / np.ptp(middle[0], axis=-1).mean()).min() < 0.8
 
 
-def test_first_frames_are_those_of_other_machines(mini_scenes):
+def test_first_frames_equal_recorded_heights(mini_scenes):
     """Heights of the middle of the body at the first ten frames, as computed on another day elsewhere."""
     _, scenes = mini_scenes
     for scene in scenes:
@@ -226,7 +226,7 @@ def test_first_frames_are_those_of_other_machines(mini_scenes):
 
 
 @pytest.mark.parametrize("world", ["elastic", "cloth"])
-def test_colours_tell_materials_apart_where_there_are_several(world):
+def test_several_materials_are_tinted(world):
     points, found = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3)), set()
     for seed in range(30):
         alone, several = (
@@ -241,7 +241,7 @@ def test_colours_tell_materials_apart_where_there_are_several(world):
     assert found == set(build_world(world, "diverse", {}).materials) and set(TINTS) == set(MATERIALS)
 
 
-def test_impossible_options_say_why(tmp_path):
+def test_generate_refuses_impossible_options(tmp_path):
     cases = [
         ({"n_frames": 0}, "n_frames"),
         ({"fps": -1.0}, "fps"),
@@ -275,7 +275,7 @@ def test_impossible_options_say_why(tmp_path):
         generate(tmp_path / "file", progress=False, **SMALL)
 
 
-def test_two_writers_do_not_share_a_folder(tmp_path):
+def test_generate_locks_its_folder(tmp_path):
     """One that makes the second of two parts, in another process, leaves the first part to others, and no more."""
     hold = "import sys; from pathlib import Path; from gsim3d.io.locks import only_one_writer\n"
     hold += "with only_one_writer(Path(sys.argv[1]), range(1, 3, 2)): print(flush=True), sys.stdin.read()"
@@ -290,7 +290,7 @@ def test_two_writers_do_not_share_a_folder(tmp_path):
     assert generate(tmp_path, processes=1, progress=False, **SMALL).n_made == 1
 
 
-def test_parts_make_the_set_of_one_call(made, tmp_path):
+def test_generate_parts_equal_one_call(made, tmp_path):
     reports = [generate(tmp_path, processes=1, part=(part, 2), progress=False, **SMALL) for part in (2, 1)]
     assert [report.n_made for report in reports] == [1, 2]
     assert [folder.parent.name for folder in reports[0].folders] == ["torus"]
@@ -302,7 +302,7 @@ def test_parts_make_the_set_of_one_call(made, tmp_path):
             generate(tmp_path, processes=1, part=part, progress=False, **SMALL)
 
 
-def test_the_slurm_script_makes_a_part(tmp_path):
+def test_slurm_script_generates_a_part(tmp_path):
     (tmp_path / "python").write_text('#!/bin/bash\necho "$*"\n')
     (tmp_path / "python").chmod(0o755)
     slurm = {"ARRAY_TASK_ID": "12", "ARRAY_TASK_MIN": "10", "ARRAY_TASK_COUNT": "4", "CPUS_PER_TASK": "8"}
@@ -317,7 +317,7 @@ def test_the_slurm_script_makes_a_part(tmp_path):
     assert subprocess.run(command[:2], env=environment, capture_output=True).returncode == 2
 
 
-def test_presets_build():
+def test_presets_build_every_world():
     for preset in PRESETS:
         for world in WORLDS:
             assert build_world(world, preset, {}).scenes()
@@ -329,7 +329,7 @@ def test_presets_build():
         assert mini == dataclasses.replace(published, n_frames=24, n_trajectories=34)
 
 
-def test_sets_that_are_older_than_some_options_go_on():
+def test_fingerprint_ignores_later_options_at_defaults():
     """The fingerprint of today's defaults is that of before there were `by_name` and `ground_albedo`."""
     assert Elastic(n_frames=9).fingerprint("ball") == "9f3e7e705993520d240f078b4f98e4553795565c0b370a0101cae9c530d382f8"
 
@@ -366,7 +366,7 @@ def test_published_ground_is_plain():
     assert (view.rgb[view.segmentation == 0].max(1) == 0).mean() > 0.9
 
 
-def test_cameras_differ_from_scene_to_scene_as_far_as_they_may(tmp_path):
+def test_camera_spread_bounds_the_rigs(tmp_path):
     plain, spread = (build_world("elastic", "mini", {**SMALL, **more}) for more in ({}, {"camera_spread": 0.06}))
     assert plain.fingerprint("ball") != spread.fingerprint("ball") and plain.rig(("ball", 1)).n_cams == 3
     np.testing.assert_array_equal(plain.rig(("ball", 1)).viewmats, plain.rig().viewmats)
@@ -395,7 +395,7 @@ def test_cameras_differ_from_scene_to_scene_as_far_as_they_may(tmp_path):
     assert len({scene.cameras_at([0], [0]).viewmats.numpy().tobytes() for scene in scenes}) == len(scenes) > 1
 
 
-def test_cameras_that_see_beyond_near_and_far_are_refused():
+def test_world_refuses_ground_beyond_near_and_far():
     build_world("elastic", "mini", {"camera_spread": 0.05})
     with pytest.raises(InputError, match="the ground is seen from"):
         build_world("elastic", "mini", {"camera_spread": 0.2})
@@ -404,7 +404,7 @@ def test_cameras_that_see_beyond_near_and_far_are_refused():
             build_world("elastic", "mini", {"camera_spread": spread})
 
 
-def test_published_bodies_are_as_large_as_they_should_be():
+def test_published_bodies_have_their_share_of_the_mask():
     """Masked scores mean nothing without the share of bodies in the mask. As long as in the sets, of fewer frames."""
     few = {"n_frames": 12, "n_trajectories": 6, "samples": 1}
     elastic = build_world("elastic", "published", {**few, "fps": 6.0, "n_cams": 4, "image_size": 64})
@@ -430,7 +430,7 @@ HELD_OUT_SETS = [
 
 
 @pytest.mark.parametrize("preset, world, subset", HELD_OUT_SETS)
-def test_held_out_sets_differ_from_the_training_set_as_they_say(preset, world, subset):
+def test_held_out_sets_differ_as_documented(preset, world, subset):
     length = {} if subset == "no-ground" else {"n_frames": 2}
     train, other = (build_world(world, preset, {"subset": s, **TINY, **length}) for s in ("train", subset))
     np.testing.assert_array_equal(train.rig().viewmats, other.rig().viewmats)
@@ -460,7 +460,7 @@ def test_held_out_sets_differ_from_the_training_set_as_they_say(preset, world, s
 
 
 @pytest.mark.parametrize("world", WORLDS)
-def test_every_world_makes_the_same_scene_twice(world):
+def test_worlds_repeat_a_scene(world):
     settings = build_world(world, "mini", {**TINY, "n_frames": 6, "depth": True})
     first, second = (settings.make("torus", 1) for _ in range(2))
     assert first.states.keys() == second.states.keys() and ("cloth" in first.states) == (world == "cloth")
@@ -472,7 +472,7 @@ def test_every_world_makes_the_same_scene_twice(world):
     assert set(np.unique(labels)) == set(range(2 + len(first.states)))
 
 
-def test_depth_images(tmp_path):
+def test_generated_depth_images(tmp_path):
     """Depth lifted into the world lies on the ground where the ground is shown, and above it elsewhere."""
     import cv2
 
@@ -494,7 +494,7 @@ def test_depth_images(tmp_path):
         assert world[labels[cam] == 3, 2].min() > -0.05 and (labels[cam] == 3).any()
 
 
-def test_meshes_that_are_closed_by_position_are_taken_and_others_refused(tmp_path):
+def test_generate_takes_closed_meshes_only(tmp_path):
     vertices = "v 0 0 0\nv 1 0 0\nv 0 0 1\nv 0.3 1 0.3\nv 0 0 0\nv 1 0 0\nv 0.3 -1 0.3\n"  # two stand twice
     faces = "f 5 4 6\nf 2 4 3\nf 3 4 1\nf 1 2 7\nf 6 3 7\nf 3 5 7\n"
     (tmp_path / "closed.obj").write_text(vertices + faces)
@@ -507,7 +507,7 @@ def test_meshes_that_are_closed_by_position_are_taken_and_others_refused(tmp_pat
         generate(tmp_path / "out", meshes=(str(tmp_path / "open.obj"),), **options)
 
 
-def test_bad_draws_are_counted_and_drawn_again(tmp_path):
+def test_rejected_draws_are_counted_and_redrawn(tmp_path):
     """Bodies that are thrown hard leave the view now and then; the scene that is written does not."""
     report = generate(tmp_path, "rigid", processes=1, progress=False, speed=2.5, lift=(2.0, 5.0), **SMALL)
     assert sum(report.rejected.values()) > 0 and set(report.rejected) <= {
@@ -520,13 +520,13 @@ def test_bad_draws_are_counted_and_drawn_again(tmp_path):
             assert pixels.min() > 0 and pixels.max() < world.image_size
 
 
-def test_genesis_says_how_to_install_it(tmp_path, monkeypatch):
+def test_missing_genesis_error_names_the_package(tmp_path, monkeypatch):
     monkeypatch.setattr("gsim3d.synth.run.find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"pip install 'gsim3d\[genesis\]'"):
         generate(tmp_path, engine="genesis", processes=1, progress=False, **SMALL)
 
 
-def test_command(tmp_path, capsys):
+def test_generate_command(tmp_path, capsys):
     parser = argparse.ArgumentParser()
     add_arguments(parser)
     assert "examples:" in parser.format_help()

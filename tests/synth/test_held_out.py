@@ -23,11 +23,11 @@ def generated(root, count, seed, **changes):
     return folders
 
 
-def test_seeds_are_named_once():
+def test_held_out_seeds_are_unique():
     assert SETS == {"validation": (VALIDATION_SEED, 24), "test": (TEST_SEED, 56)} and VALIDATION_SEED != TEST_SEED
 
 
-def test_a_set_is_known_by_what_its_scenes_say(tmp_path):
+def test_set_of_generated_scenes(tmp_path):
     folders = generated(tmp_path / "a", 4, VALIDATION_SEED)
     found = set_of(folders)
     assert found["name"] == "validation" and found["subset"] is None and found["bodies"] == {"body 0": 2, "body 1": 2}
@@ -42,13 +42,13 @@ def test_a_set_is_known_by_what_its_scenes_say(tmp_path):
 
 
 @pytest.mark.parametrize("says", ["{}", "[]", "no JSON", '{"world": ["a"], "seed": 77}', '{"world": "x", "seed": 77}'])
-def test_scenes_of_others_are_of_no_set(tmp_path, says):
+def test_set_of_other_scenes_is_none(tmp_path, says):
     (tmp_path / "metadata.json").write_text(says)
     assert origin_of(tmp_path) is None and set_of([tmp_path]) is None and origin_of(tmp_path / "absent") is None
 
 
 @pytest.mark.parametrize("seed, part, count", [(VALIDATION_SEED, "all", 3), (TEST_SEED, "all", 3), (5, "test", 1)])
-def test_all_of_a_held_out_set_is_scored(tmp_path, capsys, seed, part, count):
+def test_held_out_sets_are_scored_as_a_whole(tmp_path, capsys, seed, part, count):
     folders = generated(tmp_path / "data", 3, seed)
     for folder in folders:
         for labels in folder.glob("*/seg_*.png"):
@@ -61,7 +61,7 @@ def test_all_of_a_held_out_set_is_scored(tmp_path, capsys, seed, part, count):
 
 
 @pytest.mark.parametrize("seed", [VALIDATION_SEED, TEST_SEED])
-def test_no_training_sees_it(tmp_path, capsys, seed):
+def test_training_leaves_held_out_sets_out(tmp_path, capsys, seed):
     generated(tmp_path / "data", 3, seed)
     (tmp_path / "train.yaml").write_text("preset: tiny\n")
     command = ["train", str(tmp_path / "train.yaml"), "--data", str(tmp_path / "data"), "--out", str(tmp_path / "run")]

@@ -54,7 +54,7 @@ TWO = {
 
 
 @pytest.mark.parametrize("name", TWO)
-def test_all_objects_arrive(tmp_path, name):
+def test_load_body_reads_all_objects(tmp_path, name):
     body = load_body(write(tmp_path, TWO[name]), "z")
     assert len(body.vertices) == 16 and len(body.faces) == 24
     assert len(np.unique(np.sort(body.faces, 1), axis=0)) == 24
@@ -64,7 +64,7 @@ def test_all_objects_arrive(tmp_path, name):
     assert np.ptp(body.collision_vertices, axis=0)[0] > 0.9 * size[0]
 
 
-def test_a_cavity_stays_a_cavity(tmp_path):
+def test_load_body_keeps_cavities(tmp_path):
     inner = "".join(f"v {0.25 + x / 2} {0.25 + y / 2} {0.25 + z / 2}\n" for x, y, z in CORNERS)
     for outer, hole in ((SIDES, INWARDS), (INWARDS, SIDES)):
         body = load_body(write(tmp_path, vertices() + sides(1, outer) + inner + sides(9, hole)), "z")
@@ -81,14 +81,14 @@ MATERIALS = {
 
 
 @pytest.mark.parametrize("name", MATERIALS)
-def test_every_material_has_its_colour(tmp_path, name):
+def test_obj_materials_keep_their_colours(tmp_path, name):
     body = load_body(write(tmp_path, "mtllib two.mtl\n" + MATERIALS[name]), "z")
     assert len(body.faces) == 24
     np.testing.assert_allclose(seen(body, "left"), np.tile(RED, (12, 1)))
     np.testing.assert_allclose(seen(body, "right"), np.tile(BLUE, (12, 1)))
 
 
-def test_one_body_of_several_materials_and_files(tmp_path):
+def test_obj_body_of_several_materials_and_files(tmp_path):
     (tmp_path / "more.mtl").write_text("newmtl leaf\nKd 0 1 0\n")
     text = "mtllib two.mtl\nmtllib more.mtl\n" + vertices() + "usemtl red\n" + sides(1, SIDES[:1]) + "usemtl leaf\n"
     body = load_body(write(tmp_path, text + sides(1, SIDES[1:])), "z")
@@ -100,7 +100,7 @@ def test_one_body_of_several_materials_and_files(tmp_path):
     np.testing.assert_allclose(load_body(one).paint(load_body(one).corners[:, 0]), [GREEN] * 12)
 
 
-def test_a_texture_beside_a_colour_and_a_pattern(tmp_path):
+def test_obj_texture_beside_colour_and_pattern(tmp_path):
     Image.fromarray(np.full((2, 2, 3), [0, 255, 0], np.uint8)).save(tmp_path / "skin.png")
     (tmp_path / "skin.mtl").write_text("newmtl skin\nKd 0.8 0.8 0.8\nmap_Kd -s 1 1 1 skin.png\n")
     textured = "".join("f " + " ".join(f"{k + 1}/1" for k in side) + "\n" for side in SIDES)
@@ -114,7 +114,7 @@ def test_a_texture_beside_a_colour_and_a_pattern(tmp_path):
 
 
 @pytest.mark.parametrize("colours", [(RED, BLUE), ((255, 0, 0), (0, 0, 255))])
-def test_colours_of_vertices_of_an_obj(tmp_path, colours):
+def test_obj_vertex_colours(tmp_path, colours):
     text = vertices(0, colours[0]) + sides(1) + vertices(3, colours[1]) + sides(9)
     body = load_body(write(tmp_path, text), "z")
     np.testing.assert_allclose(seen(body, "left"), np.tile(RED, (12, 1)))
@@ -135,7 +135,7 @@ def pbr(mesh, **options):
     return mesh
 
 
-def test_pieces_of_a_glb(tmp_path):
+def test_glb_pieces_keep_their_colours(tmp_path):
     blue = Image.fromarray(np.full((2, 2, 3), [0, 0, 255], np.uint8))
     lefts = (box(0, RED), pbr(box(0), baseColorFactor=[255, 0, 0, 255]))
     rights = (box(3, BLUE), pbr(box(3), baseColorTexture=blue), pbr(box(3), baseColorFactor=[0, 0, 255, 255]))
@@ -148,7 +148,7 @@ def test_pieces_of_a_glb(tmp_path):
             np.testing.assert_allclose(seen(body, "right"), np.tile(BLUE, (12, 1)))
 
 
-def test_instances_of_a_glb_lie_where_they_are_put(tmp_path):
+def test_glb_instances_are_transformed(tmp_path):
     scene = trimesh.Scene()
     scene.add_geometry(box(0, RED), geom_name="box")
     scene.graph.update("again", matrix=trimesh.transformations.translation_matrix([3, 0, 0]), geometry="box")
@@ -177,14 +177,14 @@ def ply(folder, vertex_type, colours_of):
 
 
 @pytest.mark.parametrize("kind", [("uchar", "vertex"), ("float", "vertex"), ("uchar", "face")])
-def test_colours_of_a_ply(tmp_path, kind):
+def test_ply_vertex_and_face_colours(tmp_path, kind):
     body = load_body(ply(tmp_path, *kind), "z")
     assert len(body.faces) == 24
     np.testing.assert_allclose(seen(body, "left"), np.tile(RED, (12, 1)))
     np.testing.assert_allclose(seen(body, "right"), np.tile(BLUE, (12, 1)))
 
 
-def test_several_bodies_of_stl_and_off(tmp_path):
+def test_stl_and_off_of_several_bodies(tmp_path):
     both = trimesh.util.concatenate([box(0), box(3)])
     both.export(tmp_path / "two.off")
     both.export(tmp_path / "two.stl")
@@ -219,7 +219,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_would_be_lost_is_refused(tmp_path, name):
+def test_load_body_refuses_what_it_would_lose(tmp_path, name):
     make, message = REFUSED[name]
     path = make(tmp_path)
     with pytest.raises(InputError, match=message) as error:
@@ -227,7 +227,7 @@ def test_what_would_be_lost_is_refused(tmp_path, name):
     assert str(path) in str(error.value)
 
 
-def test_textures_that_are_not_there_are_named(tmp_path):
+def test_obj_missing_textures_are_named(tmp_path):
     path = write(tmp_path, "mtllib skin.mtl\nvt 0 0\nusemtl skin\n" + vertices() + sides(1))
     (tmp_path / "skin.mtl").write_text("newmtl skin\nmap_Kd skin.png\n")
     with pytest.raises(InputError, match="texture skin.png of material 'skin' is not beside skin.mtl"):
@@ -243,7 +243,7 @@ def test_textures_that_are_not_there_are_named(tmp_path):
         load_body(path)
 
 
-def test_remarks_in_material_files_and_another_name_of_the_only_material(tmp_path):
+def test_mtl_comments_and_single_material(tmp_path):
     path = write(tmp_path, "mtllib skin.mtl\nusemtl exported\n" + vertices() + sides(1))
     (tmp_path / "skin.mtl").write_text("newmtl skin # the one\nKd 0.25 0.5 1.000  # red, green, blue\n")
     body = load_body(path)
@@ -253,7 +253,7 @@ def test_remarks_in_material_files_and_another_name_of_the_only_material(tmp_pat
         load_body(path)
 
 
-def test_an_stl_with_colours_is_refused(tmp_path):
+def test_stl_colours_are_refused(tmp_path):
     data = bytearray(trimesh.exchange.stl.export_stl(box(0)))
     data[:80] = b"COLOR=" + struct.pack("4B", 255, 0, 0, 255) + bytes(70)
     (tmp_path / "body.stl").write_bytes(bytes(data))

@@ -29,7 +29,7 @@ def ball():
     return 0.3 * vertices + [0.1, -0.1, 0.6], faces
 
 
-def test_cameras_look_at_the_target_from_the_right_distance(rig):
+def test_two_rings_look_at_the_target(rig):
     target = np.array([[0.0, 0.0, 0.5]])
     pixels, depth = cameras.project(target, rig.viewmats, rig.Ks)
     np.testing.assert_allclose(pixels[:, 0], SIZE / 2, atol=1e-9)
@@ -41,7 +41,7 @@ def test_cameras_look_at_the_target_from_the_right_distance(rig):
     assert (up[:, 0, 1] < SIZE / 2).all()  # world up is up in the image: y counts down
 
 
-def test_rays_and_projection_are_inverse(rig):
+def test_pixel_rays_invert_projection(rig):
     origins, directions = cameras.pixel_rays(rig, 2)
     assert directions.shape == (4, SIZE, SIZE, 4, 3)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1, atol=1e-12)
@@ -64,7 +64,7 @@ def test_workspace_origin_lies_below_every_pixel_in_range(rig):
         assert (points >= origin).all()
 
 
-def test_labels_match_the_projected_mesh(rig, ball):
+def test_renderer_labels_match_the_projected_mesh(rig, ball):
     vertices, faces = ball
     view = draw(rig, vertices, faces)
     pixels, _ = cameras.project(vertices, rig.viewmats, rig.Ks)
@@ -74,7 +74,7 @@ def test_labels_match_the_projected_mesh(rig, ball):
         np.testing.assert_allclose([x.max() + 1, y.max() + 1], pixels[cam].max(0), atol=1.0)
 
 
-def test_labels_match_the_ground_disc(rig, ball):
+def test_renderer_labels_match_the_ground_disc(rig, ball):
     view = draw(rig, ball[0] + [0, 0, 50], ball[1])
     y, x = np.indices((SIZE, SIZE)) + 0.5
     for cam in range(rig.n_cams):
@@ -88,7 +88,7 @@ def test_labels_match_the_ground_disc(rig, ball):
     assert set(np.unique(view.segmentation)) == {render.BACKGROUND, render.GROUND}
 
 
-def test_instances_agree_with_labels(rig, ball):
+def test_renderer_instances_agree_with_labels(rig, ball):
     view = draw(rig, *ball)
     assert set(np.unique(view.segmentation)) == {0, 1, 3} and set(np.unique(view.instances)) == {0, 1, 2}
     assert ((view.instances == 2) == (view.segmentation == 3)).all()
@@ -96,13 +96,13 @@ def test_instances_agree_with_labels(rig, ball):
 
 
 @pytest.mark.parametrize("value", [0, 255])
-def test_background_colour(rig, ball, value):
+def test_renderer_background_colour(rig, ball, value):
     view = draw(rig, *ball, background=[value / 255] * 3)
     assert (view.rgb[view.segmentation == render.BACKGROUND].mean(0) * (1 if value else -1) > -20 + value * 0.9).all()
     assert (view.rgb[:, 0, 0] == value).all()
 
 
-def test_the_body_hides_the_ground_and_the_ground_hides_the_body(rig, ball):
+def test_renderer_occlusion_of_body_and_ground(rig, ball):
     vertices, faces = ball
     below = draw(rig, vertices * 0.5 - [0, 0, 0.5], faces)
     assert not (below.segmentation == render.BODY).any()
@@ -110,7 +110,7 @@ def test_the_body_hides_the_ground_and_the_ground_hides_the_body(rig, ball):
     assert (above.segmentation == render.BODY).any((1, 2)).all()
 
 
-def test_shadow_lies_where_light_through_the_body_meets_the_ground(rig, ball):
+def test_renderer_shadow_position(rig, ball):
     vertices, faces = ball
     lit = draw(rig, vertices + [0, 0, 50], faces)
     dark = draw(rig, vertices, faces)
@@ -130,7 +130,7 @@ def test_shadow_lies_where_light_through_the_body_meets_the_ground(rig, ball):
     assert checked >= 2
 
 
-def test_shading_of_a_sphere_follows_the_light(rig):
+def test_renderer_shades_a_sphere(rig):
     vertices, faces = shapes.icosphere(5)
     vertices = 0.3 * vertices + [0, 0, 1.0]
     view = draw(rig, vertices, faces, samples=1)
@@ -151,13 +151,13 @@ def test_shading_of_a_sphere_follows_the_light(rig):
     assert np.concatenate(errors).max() < 4
 
 
-def test_more_samples_smooth_the_outline(rig, ball):
+def test_renderer_samples_smooth_outlines(rig, ball):
     rough, smooth = draw(rig, *ball, samples=1), draw(rig, *ball, samples=4)
     assert (rough.segmentation != smooth.segmentation).mean() < 0.02
     np.testing.assert_allclose(rough.rgb.mean(), smooth.rgb.mean(), rtol=0.02)
 
 
-def test_body_beside_or_behind_a_camera_is_not_drawn_there(rig, ball):
+def test_renderer_skips_bodies_beside_or_behind_cameras(rig, ball):
     far_up = draw(rig, ball[0] + [0, 0, 30], ball[1])
     assert not (far_up.segmentation == render.BODY).any()
     position = -rig.viewmats[0, :3, :3].T @ rig.viewmats[0, :3, 3]

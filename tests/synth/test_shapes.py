@@ -35,24 +35,24 @@ def test_procedural_bodies_are_closed_and_face_outwards(name):
 
 
 @pytest.mark.parametrize("pattern", shapes.PATTERNS)
-def test_patterns_use_several_colours(pattern):
+def test_patterns_have_several_colours(pattern):
     points = body_of("ball").vertices
     painted = shapes.PATTERNS[pattern](points, shapes.PALETTE[:3])
     _, counts = np.unique(painted, axis=0, return_counts=True)
     assert len(counts) >= 2 and counts.min() > 0.02 * len(points)
 
 
-def test_another_seed_paints_another_body():
+def test_procedural_paint_depends_on_the_seed():
     colours = [body_of("ball", seed).paint(body_of("ball").vertices) for seed in range(4)]
     assert not any(np.array_equal(colours[0], other) for other in colours[1:])
 
 
-def test_unknown_object():
+def test_unknown_object_is_refused():
     with pytest.raises(InputError, match="cube.*choose from ball"):
         body_of("cube")
 
 
-def test_mesh_file_is_turned_upright_and_scaled(tmp_path):
+def test_load_body_turns_and_scales(tmp_path):
     (tmp_path / "tower.obj").write_text(CUBE)
     for up, axis in (("z", 2), ("y", 1)):
         body = meshes.load_body(tmp_path / "tower.obj", up)
@@ -62,7 +62,7 @@ def test_mesh_file_is_turned_upright_and_scaled(tmp_path):
         assert body.name == "tower" and len(body.vertices) == 8
 
 
-def test_mesh_texture_is_looked_up_at_the_corner(tmp_path):
+def test_obj_texture_coordinates_start_at_the_lower_left(tmp_path):
     """The lower left corner of the image has uv (0, 0)."""
     from PIL import Image
 
@@ -86,7 +86,7 @@ def test_mesh_texture_is_looked_up_at_the_corner(tmp_path):
     np.testing.assert_allclose(by_vertex[(0.0, 0.0, 0.0)], [1, 0, 0], atol=1e-12)
 
 
-def test_large_mesh_collides_with_few_vertices(tmp_path):
+def test_load_body_clusters_large_collision_meshes(tmp_path):
     trimesh.creation.icosphere(subdivisions=4).export(tmp_path / "fine.ply")
     body = meshes.load_body(tmp_path / "fine.ply", "z")
     assert len(body.vertices) == 2562
@@ -95,7 +95,7 @@ def test_large_mesh_collides_with_few_vertices(tmp_path):
 
 
 @pytest.mark.parametrize("text", [None, "", "no mesh\n", "v 0 0 0\nv 0 0 0\nv 0 0 0\nf 1 2 3\n"])
-def test_mesh_that_cannot_be_used(tmp_path, text):
+def test_load_body_refuses_unusable_meshes(tmp_path, text):
     path = Path(tmp_path / "bad.obj")
     if text is not None:
         path.write_text(text)
@@ -104,7 +104,7 @@ def test_mesh_that_cannot_be_used(tmp_path, text):
 
 
 @pytest.mark.parametrize("suffix", [".off", ".stl", ".ply", ".glb"])
-def test_faces_of_vertices_that_are_not_there(suffix, tmp_path):
+def test_load_body_refuses_faces_of_missing_vertices(suffix, tmp_path):
     mesh = trimesh.creation.box()
     mesh.export(tmp_path / f"bad{suffix}")
     data = (tmp_path / f"bad{suffix}").read_bytes()
@@ -119,14 +119,14 @@ def test_faces_of_vertices_that_are_not_there(suffix, tmp_path):
         meshes.load_body(tmp_path / f"bad{suffix}")
 
 
-def test_meshes_of_many_bytes_are_refused_unread(tmp_path):
+def test_load_body_refuses_large_files_unread(tmp_path):
     with open(tmp_path / "large.stl", "wb") as file:
         file.truncate(mesh_files.MAX_MESH + 1)
     with pytest.raises(InputError, match="large.stl .*it has .* bytes; more than .* are refused"):
         meshes.load_body(tmp_path / "large.stl")
 
 
-def test_meshes_of_an_installed_genesis_are_found_without_importing_it(tmp_path, monkeypatch):
+def test_genesis_meshes_are_found_without_import(tmp_path, monkeypatch):
     folder = tmp_path / "genesis" / "assets" / "meshes"
     (folder / "duck").mkdir(parents=True)
     (tmp_path / "genesis" / "__init__.py").write_text("raise RuntimeError('imported')")
@@ -156,7 +156,7 @@ def test_meshes_of_an_installed_genesis_are_found_without_importing_it(tmp_path,
     assert "genesis" not in sys.modules
 
 
-def test_holes_are_filled_with_the_colours_of_their_borders(tmp_path):
+def test_fill_holes_uses_colours_of_borders(tmp_path):
     """Two holes of a painted body, each closed by a fan whose corners have the colours of the edges beside it."""
     mesh = trimesh.creation.icosphere(subdivisions=2)
     colours = np.clip(mesh.vertices * 0.4 + 0.5, 0, 1)

@@ -94,7 +94,7 @@ def unpacked(page):
     return header, out
 
 
-def test_what_is_packed_comes_back_within_its_bounds(tmp_path):
+def test_player_quantisation_is_within_bounds(tmp_path):
     frames = moving(9)
     write_player(tmp_path / "a.html", frames, fps=FPS, title="A <ball>")
     page = (tmp_path / "a.html").read_text()
@@ -114,7 +114,7 @@ def test_what_is_packed_comes_back_within_its_bounds(tmp_path):
         assert np.abs(rest - frame.sh[:, 1:].numpy()).max() <= 0.5 / 128 + 1e-6
 
 
-def test_frames_may_have_fewer_gaussians(tmp_path):
+def test_player_frames_of_different_counts(tmp_path):
     long = make(40)
     fewer = {name: getattr(long, name)[:25] for name in ("means", "quats", "scales", "opacities", "sh")}
     short = dataclasses.replace(long, **fewer, cu_rows=torch.tensor([0, 25]))
@@ -123,7 +123,7 @@ def test_frames_may_have_fewer_gaussians(tmp_path):
     assert (channels["opacities"][1, 25:] == 0).all() and (channels["opacities"][1, :25] > 0).all()
 
 
-def test_sixteen_thousand_moving_gaussians_fit(tmp_path):
+def test_player_file_size_of_16k_gaussians(tmp_path):
     """80 frames of bodies that fall, turn and bounce."""
     g = torch.Generator().manual_seed(0)
     first = make(16_384, 0)
@@ -148,7 +148,7 @@ def test_sixteen_thousand_moving_gaussians_fit(tmp_path):
         ({"view": View(np.eye(3), np.eye(3), 4, 4)}, "viewmat"),
     ],
 )
-def test_what_cannot_be_played_is_refused(given, says, tmp_path):
+def test_write_player_refuses_unusable_input(given, says, tmp_path):
     arguments = {"frames": [make(3)], "fps": FPS, "path": "a.html", **given}
     with pytest.raises(InputError, match=says):
         write_player(tmp_path / arguments.pop("path"), arguments.pop("frames"), **arguments)
@@ -156,7 +156,7 @@ def test_what_cannot_be_played_is_refused(given, says, tmp_path):
 
 
 @browsing
-def test_a_browser_plays_it_as_the_package_renders_it(tmp_path):
+def test_player_in_browser_equals_rasterizer(tmp_path):
     frames, seen = moving(10), view()
     truth = [(rendered(frame, seen) * 255).byte().numpy() for frame in frames]
     write_player(tmp_path / "a.html", frames, fps=FPS, view=seen, truth=truth, start=3, title="Falling")
@@ -192,7 +192,7 @@ def test_a_browser_plays_it_as_the_package_renders_it(tmp_path):
 
 
 @browsing
-def test_motion_waits_where_little_motion_is_wanted(tmp_path):
+def test_player_respects_reduced_motion(tmp_path):
     write_player(tmp_path / "a.html", moving(3), fps=FPS)
     with Browser(300, 300, "--force-prefers-reduced-motion") as browser:
         browser.open((tmp_path / "a.html").as_uri())
