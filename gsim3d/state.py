@@ -193,37 +193,42 @@ def attributes_of(*kinds: str) -> tuple[str, ...]:
 class Particles(TensorRecord):
     """The state of the simulator: particles with view-independent latent features.
 
-    means: [N, 3] metres, world.            opacities: [N] in (0, 1).
-    dynamic_latents: [N, Fd], change with time.   static_latents: [N, Fs], do not.
-    cu_rows: int64 [Q + 1]; rows of cloud q are cu_rows[q] .. cu_rows[q + 1].
-    cloud_scene, cloud_step: int64 [Q], sorted by (scene, step).
-    activity: uint8 [N], 0 dynamic, 1 frozen (never moves), 2 asleep (never changes, and the dynamics does not see it;
-        see gsim3d.numerics.policy). A masked-out particle is absent.
-    origin: float64 [B, 3] metres, lower corner of each scene's workspace.
-    world_offset: float64 [B, 3] metres, the point of each scene's world that cameras, origin and positions count from,
-        so that float32 holds them; None: 0. Coordinates in edits and files are those of the world.
-    quats [N, 4] (w, x, y, z), scales [N, 3] metres, sh [N, K, 3]: only in explicit models.
-    orientations: [N, 4] (w, x, y, z), a rotation of the drawn appearance since encoding, from edits
-        (:mod:`gsim3d.effects.edits`) and, in models with ``turning``, from the rotation of the surrounding particles.
-    color_transform: [N, 3, 3], a matrix that decoded colours of latent models are multiplied by; set by edits.
-    frozen_appearance: bool [N], particles whose changing latents and colours stay constant; only where an effects spec
-        selects them (``appearance.frozen_appearance``). Resolved once at the start of a rollout and carried along.
-    initial_latents: [N, Fd], the dynamic latents of frozen particles at the start of the simulation; only in models
-        with ``background="relightable"``.
-    velocity: [N, 3] metres a step: the last displacement of simulated particles, the mean displacement since the oldest
-        step for encoded particles of the newest step, 0 elsewhere; only in models with ``velocity``.
-    irradiance_gain: [N, 3], factors of the colours of simulated particles: irradiance now over irradiance at encoding;
-        only in models with ``lights``.
-    light_occlusion: [N, 2 L], optical depth towards each light at encoding and now
-        (:func:`gsim3d.dynamics.shade.shade`), or [N, 3 L]: irradiance at encoding, n.l, and irradiance now
-        (:func:`gsim3d.dynamics.daylight.daylight`); negative where unknown.
-    rest_positions: [N, 3] metres, positions at the start of the simulation, the rest shape of elastic bodies; only in
-        models with ``deformation``.
-    body: [N, 3] metres, a place of the body that a row is a part of, the same for all its rows: where the middle of
-        what is seen of it was when it was encoded (:func:`gsim3d.dynamics.bodies.bodies`); only of a model with
-        ``pushes``.
+    Particles of two encoded steps are not aligned (each step sees other pixels); those of two simulated steps are.
 
-    Rows of two encoded steps are not aligned (each step sees other pixels); rows of two simulated steps are.
+    Attributes:
+        means: [N, 3] metres, world.
+        opacities: [N] in (0, 1).
+        dynamic_latents: [N, Fd], change with time.
+        static_latents: [N, Fs], do not.
+        cu_rows: int64 [Q + 1]; the particles of cloud q are cu_rows[q] .. cu_rows[q + 1].
+        cloud_scene: int64 [Q]; clouds are sorted by (scene, step).
+        cloud_step: int64 [Q].
+        activity: uint8 [N], 0 dynamic, 1 frozen (never moves), 2 asleep (never changes, and the dynamics does not see
+            it; see :mod:`gsim3d.numerics.policy`). A masked-out particle is absent.
+        origin: float64 [B, 3] metres, lower corner of each scene's workspace.
+        quats: [N, 4] (w, x, y, z); only in explicit models.
+        scales: [N, 3] metres; only in explicit models.
+        sh: [N, K, 3]; only in explicit models.
+        orientations: [N, 4] (w, x, y, z), a rotation of the drawn appearance since encoding, from edits
+            (:mod:`gsim3d.effects.edits`) and, in models that predict it, from the rotation of the particles around.
+        color_transform: [N, 3, 3], a matrix that decoded colours of latent models are multiplied by; set by edits.
+        frozen_appearance: bool [N], particles whose changing latents and colours stay constant; only where an effects
+            spec selects them (``appearance.frozen_appearance``). Resolved once at the start of a rollout.
+        initial_latents: [N, Fd], the dynamic latents at the start of the simulation; only in models with
+            ``background="relightable"``.
+        velocity: [N, 3] metres a step: the last displacement of simulated particles, the mean displacement since the
+            oldest step for encoded particles of the newest step, 0 elsewhere; only in models with inertia.
+        irradiance_gain: [N, 3], factors of the colours of simulated particles: irradiance now over irradiance at
+            encoding; only in models with lights.
+        light_occlusion: [N, 2 L], optical depth towards each light at encoding and now, or [N, 3 L]: irradiance at
+            encoding, n.l, and irradiance now; negative where unknown.
+        rest_positions: [N, 3] metres, positions at the start of the simulation, the rest shape of elastic bodies; only
+            in models with shape matching.
+        body: [N, 3] metres, where the middle of what is seen of the particle's body was when it was encoded; only in
+            models that segment bodies.
+        world_offset: float64 [B, 3] metres, the point of each scene's world that cameras, origin and positions count
+            from, so that float32 holds them; None: 0. Coordinates in edits and files are those of the world.
+        known: clouds as the host knows them; see :attr:`clouds`.
     """
 
     means: Tensor
@@ -248,16 +253,18 @@ class Particles(TensorRecord):
     rest_positions: Tensor | None = None
     body: Tensor | None = None
     world_offset: Tensor | None = None
-    known: CloudTable | None = None  # see clouds
+    known: CloudTable | None = None
 
     ROW_FIELDS = tuple(ATTRIBUTES)
 
     @property
     def n_rows(self) -> int:
+        """N."""
         return self.means.shape[0]
 
     @property
     def n_clouds(self) -> int:
+        """Q."""
         return self.cloud_scene.shape[0]
 
     @property
@@ -268,7 +275,7 @@ class Particles(TensorRecord):
             object.__setattr__(self, "known", CloudTable.read(*tensors))
         return self.known
 
-    def with_clouds(self, table: CloudTable, **fields) -> Particles:
+    def with_clouds(self, table: CloudTable, **fields: Tensor) -> Particles:
         """These particles packed as ``table`` says; ``fields`` replaces what changes with it."""
         cu_rows, scene, step = table.tensors
         return dataclasses.replace(self, **fields, cu_rows=cu_rows, cloud_scene=scene, cloud_step=step, known=table)
@@ -421,11 +428,15 @@ def single_steps(particles: Particles) -> list[Particles]:
 class Gaussians(TensorRecord):
     """3D Gaussians, packed like the particles they came from.
 
-    means [N, 3] metres, quats [N, 4] (w, x, y, z), scales [N, 3] metres, opacities [N] in (0, 1),
-    sh [N, K, 3] coefficients of the standard 3DGS basis (K = (degree + 1)^2; colour = sum + 0.5, clamped at 0); None
-    where no colour is asked for,
-    cu_rows int64 [Q + 1],
-    world_offset float64 [Q, 3] metres, what positions of a cloud count from; None: 0.
+    Attributes:
+        means: [N, 3] metres.
+        quats: [N, 4] (w, x, y, z).
+        scales: [N, 3] metres.
+        opacities: [N] in (0, 1).
+        sh: [N, K, 3] coefficients of the standard 3DGS basis (K = (degree + 1)^2; colour = sum + 0.5, clamped at 0);
+            None where no colour is asked for.
+        cu_rows: int64 [Q + 1].
+        world_offset: float64 [Q, 3] metres, what positions of a cloud count from; None: 0.
     """
 
     means: Tensor

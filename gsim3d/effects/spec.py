@@ -160,6 +160,8 @@ class EffectsSpec:
     def from_dict(cls, values: dict[str, Any] | None) -> EffectsSpec:
         """The spec of nested plain values, those of older versions included.
 
+        Args:
+            values: as :meth:`to_dict` makes them; None: the default.
         Raises:
             InputError: a key is unknown or removed, or a value is of another type or out of range.
         """
@@ -175,7 +177,7 @@ class EffectsSpec:
 
     @classmethod
     def load(cls, path: str | Path) -> EffectsSpec:
-        """The spec of a YAML (or JSON) file."""
+        """The spec of the YAML (or JSON) file ``path``."""
         values = read_yaml(path, "effects")
         if values is not None and not isinstance(values, dict):
             raise InputError(f"effects: {path} must hold a mapping; got {type(values).__name__}")
@@ -183,7 +185,7 @@ class EffectsSpec:
 
     @classmethod
     def of_scene(cls, folder: str | Path) -> EffectsSpec | None:
-        """The spec of effects.yaml in a scene's folder or up to two folders above (a whole set's); None without one."""
+        """The spec of effects.yaml in ``folder``, of a scene, or up to two folders above (a whole set's); else None."""
         folder = Path(folder).absolute()
         for place in (folder, folder.parent, folder.parent.parent):
             if (place / FILE).is_file():
@@ -191,7 +193,7 @@ class EffectsSpec:
         return None
 
     def save(self, path: str | Path) -> None:
-        """Writes a YAML file, or JSON if the name ends in .json."""
+        """Writes ``path``, a YAML file, or JSON if the name ends in .json."""
         path = Path(path)
         as_json = path.suffix == ".json"
         write_whole(path, json.dumps(self.to_dict(), indent=2) if as_json else yaml.safe_dump(self.to_dict()))

@@ -168,7 +168,7 @@ class StabilityReport:
         self.is_closed = True
 
     def add(self, finding: Finding) -> None:
-        """Counts a finding; those of the same kind and place become one."""
+        """Counts ``finding``; those of the same kind and place become one."""
         place = (finding.what, finding.where, finding.tensor, finding.action)
         place += (finding.scene, finding.step, finding.camera)
         with self._lock:
