@@ -120,19 +120,19 @@ def write_kubric(folder: Path, made: Made, subfolders=True) -> Path:
             "field_of_view": 0.8,
         }
         metadata = {"resolution": [width, height], "frame_rate": FPS, "num_frames": n_steps}
-        place = folder / f"cam_{cam}"
+        own = folder / f"cam_{cam}"
         for step in range(n_steps):
             labels = made.labels[step, cam]
             alpha = np.where(labels > 0, 255, 0).astype(np.uint8)[..., None]
-            rgba = place / "rgba" / f"rgba_{step}.png" if subfolders else place / f"rgba_{step:05d}.png"
+            rgba = own / "rgba" / f"rgba_{step}.png" if subfolders else own / f"rgba_{step:05d}.png"
             save(rgba, np.concatenate([made.rgb[step, cam], alpha], -1))
             marked = np.where(labels == 3, 2, 0).astype(np.uint8)
             name = f"segmentation_{step}.png" if subfolders else f"segmentation_{step:05d}.png"
             save(
-                place / "segmentation" / name if subfolders else place / name,
+                own / "segmentation" / name if subfolders else own / name,
                 marked[..., None] * np.array([0, 1, 90], np.uint8),
             )
-        (place / "metadata.json").write_text(json.dumps({"camera": camera, "metadata": metadata, **EXTRAS}))
+        (own / "metadata.json").write_text(json.dumps({"camera": camera, "metadata": metadata, **EXTRAS}))
     return folder
 
 
@@ -174,7 +174,7 @@ def write_transforms(folder: Path, made: Made) -> Path:
 
 
 def write_videos(folder: Path, made: Made, stride=2) -> Path:
-    """Folders of frames whose numbers are ``stride`` apart, filmed at ``stride`` times the rate."""
+    """Folders of frames whose numbers are ``stride`` apart, recorded at ``stride`` times the rate."""
     n_steps, n_cams, height, width = made.labels.shape
     cameras = []
     for cam in range(n_cams):

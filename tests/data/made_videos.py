@@ -33,14 +33,14 @@ def edit_boxes(file: Path, edits: dict) -> Path:
     """Replaces what boxes of an MP4 or MOV hold, whose index lies last. ``edits``: kind -> function of the bytes."""
 
     def rebuilt(data: bytes) -> bytes:
-        place, parts = 0, []
-        while place < len(data):
-            length, kind = struct.unpack_from(">I4s", data, place)
-            body = data[place + 8 : place + length]
+        begin, parts = 0, []
+        while begin < len(data):
+            length, kind = struct.unpack_from(">I4s", data, begin)
+            body = data[begin + 8 : begin + length]
             body = rebuilt(body) if kind in TREE else body
             body = edits[kind](body) if kind in edits else body
             parts.append(struct.pack(">I4s", 8 + len(body), kind) + body)
-            place += length
+            begin += length
         return b"".join(parts)
 
     file.write_bytes(rebuilt(file.read_bytes()))
@@ -63,11 +63,11 @@ def with_gaps(file: Path, gaps: list[int]) -> Path:
             b"mvhd": lambda old: old[:16] + struct.pack(">I", seconds) + old[20:],
         }
         return edit_boxes(file, edits)
-    data, place, time = bytearray(file.read_bytes()), file.read_bytes().find(b"\x1fC\xb6u"), 0
+    data, begin, time = bytearray(file.read_bytes()), file.read_bytes().find(b"\x1fC\xb6u"), 0
     for frame, gap in enumerate([*gaps, 0]):  # blocks of Matroska and WebM hold milliseconds
-        place = data.find(b"\x81" + struct.pack(">h", 1000 // RATE * frame), place) + 1
-        assert place
-        data[place : place + 2] = struct.pack(">h", time)
+        begin = data.find(b"\x81" + struct.pack(">h", 1000 // RATE * frame), begin) + 1
+        assert begin
+        data[begin : begin + 2] = struct.pack(">h", time)
         time += gap
     file.write_bytes(data)
     return file
@@ -92,10 +92,10 @@ def with_matrix(file: Path, a: int, b: int, c: int, d: int) -> Path:
 def with_duration(file: Path, seconds: float | None) -> Path:
     """Another duration of a Matroska or WebM file, as a longer sound track makes it; or none, as of a live stream."""
     data = bytearray(file.read_bytes())
-    place = data.find(b"\x44\x89\x88")
-    assert place > 0
-    data[place : place + 11] = (
-        b"\xec\x89" + bytes(9) if seconds is None else data[place : place + 3] + struct.pack(">d", 1000 * seconds)
+    begin = data.find(b"\x44\x89\x88")
+    assert begin > 0
+    data[begin : begin + 11] = (
+        b"\xec\x89" + bytes(9) if seconds is None else data[begin : begin + 3] + struct.pack(">d", 1000 * seconds)
     )
     file.write_bytes(data)
     return file

@@ -79,8 +79,8 @@ def test_check_data_without_readable_scene_draws_nothing(tmp_path, capsys):
 )
 def test_check_data_exit_code_where_it_cannot_run(data, tmp_path, capsys, arguments):
     (tmp_path / "empty").mkdir()
-    places = {"data": data, "empty": tmp_path / "empty", "file": data / "genesis" / "metadata.json"}
-    words = [word.format(**places) for word in arguments]
+    paths = {"data": data, "empty": tmp_path / "empty", "file": data / "genesis" / "metadata.json"}
+    words = [word.format(**paths) for word in arguments]
     assert main(["check-data", *words]) == 2
     assert capsys.readouterr().err.startswith("gsim3d: error: ")
 

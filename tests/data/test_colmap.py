@@ -15,7 +15,9 @@ from gsim3d.errors import InputError
 from tests.data.made_scenes import make_scene, quaternion, save
 
 
-def write_colmap(folder, made, *, binary=True, place="sparse/0", model="PINHOLE", params=None, names=None, points=None):
+def write_colmap(
+    folder, made, *, binary=True, model_folder="sparse/0", model="PINHOLE", params=None, names=None, points=None
+):
     """Each camera and step is an image with a camera of its own; the order of images is that of no name."""
     n_steps, n_cams, height, width = made.labels.shape
     cameras, images = [], []
@@ -27,7 +29,7 @@ def write_colmap(folder, made, *, binary=True, place="sparse/0", model="PINHOLE"
         cameras.append((number, model, width, height, values))
         images.append((number, quaternion(viewmat[:3, :3]), viewmat[:3, 3], number, name))
     points = np.zeros((0, 3)) if points is None else points
-    target = folder / place
+    target = folder / model_folder
     target.mkdir(parents=True, exist_ok=True)
     (write_binary if binary else write_text)(target, cameras, images[::-1], points)
     return folder
@@ -67,10 +69,10 @@ def seen_points(count=200):
 
 
 @pytest.mark.parametrize("binary", [True, False])
-@pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])
-def test_colmap_images_are_cameras_of_one_step(tmp_path, binary, place):
+@pytest.mark.parametrize("model_folder", ["sparse/0", "sparse", "colmap/sparse/0", "."])
+def test_colmap_images_are_cameras_of_one_step(tmp_path, binary, model_folder):
     made = make_scene(n_steps=1, n_cams=4)
-    folder = write_colmap(tmp_path / "scene", made, binary=binary, place=place, points=seen_points())
+    folder = write_colmap(tmp_path / "scene", made, binary=binary, model_folder=model_folder, points=seen_points())
     scene = Scene.open(folder)
     assert (scene.layout, scene.n_steps, scene.n_cams) == ("colmap", 1, 4) and find_scenes(tmp_path) == [folder]
     assert scene.camera_names[0] == "images/view 10.png" and "a camera of one instant" in describe(scene)

@@ -149,12 +149,12 @@ def test_check_pose_refuses_what_is_not_rigid(copy, layout, what):
 
 def edit_intrinsics(layout, folder, step, **values):
     """Replaces fx, fy, cx or cy of camera 1, at one step where the layout has them by step."""
-    place = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
+    entry_of = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
     names = {"fx": "fl_x", "fy": "fl_y", "cx": "cx", "cy": "cy"}
 
     def put(K, scale=(1.0, 1.0)):
         for name, value in values.items():
-            row, column = place[name]
+            row, column = entry_of[name]
             K[row][column] = value / scale[row]
 
     if layout == "genesis":

@@ -54,19 +54,19 @@ def folders(tmp_path_factory):
     return written
 
 
-def places(content, path=()):
+def key_paths(content, path=()):
     """Paths to every value inside."""
     items = content.items() if isinstance(content, dict) else enumerate(content) if isinstance(content, list) else ()
     for key, value in items:
         yield (*path, key)
-        yield from places(value, (*path, key))
+        yield from key_paths(value, (*path, key))
 
 
 def damaged(content, rng):
     """A copy with one to three values replaced or removed."""
     content = copy.deepcopy(content)
     for _ in range(rng.integers(1, 4)):
-        known = list(places(content))
+        known = list(key_paths(content))
         if not known:
             break
         *way, key = known[rng.integers(len(known))]

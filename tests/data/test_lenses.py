@@ -20,10 +20,10 @@ K = np.array([[90.0, 3.0, 101.5], [0, 95.0, 76.0], [0, 0, 1]])
 def in_lens(ray: np.ndarray, lens: Lens) -> np.ndarray:
     """The pixel that sees a ray, by OpenCV's forward models."""
     if lens.fisheye:
-        place = cv2.fisheye.distortPoints((ray[:2] / ray[2])[None, None], np.eye(3), lens.coefficients)[0, 0]
+        position = cv2.fisheye.distortPoints((ray[:2] / ray[2])[None, None], np.eye(3), lens.coefficients)[0, 0]
     else:
-        place = cv2.projectPoints(ray[None], np.zeros(3), np.zeros(3), np.eye(3), lens.coefficients)[0].ravel()
-    return K[:2, :2] @ place + K[:2, 2]
+        position = cv2.projectPoints(ray[None], np.zeros(3), np.zeros(3), np.eye(3), lens.coefficients)[0].ravel()
+    return K[:2, :2] @ position + K[:2, 2]
 
 
 @pytest.mark.parametrize("model, keys", [
@@ -37,12 +37,12 @@ def test_undistorter_samples_the_distorted_rays(model, keys):
     taken, valid = undistorter(np.stack([x, y], -1), K), undistorter.valid(K)
     seen = 0
     for column, row in ((20, 15), (101, 76), (180, 30), (60, 140), (150, 100), (199, 159)):
-        place = in_lens(np.linalg.inv(K) @ [column + 0.5, row + 0.5, 1], lens)
-        inside = ((place >= 0.5) & (place <= [199.5, 159.5])).all()
+        position = in_lens(np.linalg.inv(K) @ [column + 0.5, row + 0.5, 1], lens)
+        inside = ((position >= 0.5) & (position <= [199.5, 159.5])).all()
         assert inside == valid[row, column]
         if inside:
-            assert np.abs(taken[row, column] + 0.5 - place).max() < 0.04
-            seen += np.abs(place - [column + 0.5, row + 0.5]).max() > 0.3
+            assert np.abs(taken[row, column] + 0.5 - position).max() < 0.04
+            seen += np.abs(position - [column + 0.5, row + 0.5]).max() > 0.3
     assert seen >= 2
 
 
@@ -135,8 +135,8 @@ def test_fisheye_scene_equals_pinhole_scene(tmp_path):
     height, width = made.labels.shape[2:]
     grid = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1).reshape(-1, 1, 2)
     for step, cam in np.ndindex(made.labels.shape[:2]):
-        place = cv2.fisheye.undistortPoints(grid, made.Ks[step, cam], lens.coefficients, P=made.Ks[step, cam])
-        x, y = (place.reshape(height, width, 2) - 0.5).astype(np.float32).transpose(2, 0, 1)
+        position = cv2.fisheye.undistortPoints(grid, made.Ks[step, cam], lens.coefficients, P=made.Ks[step, cam])
+        x, y = (position.reshape(height, width, 2) - 0.5).astype(np.float32).transpose(2, 0, 1)
         for kind, image, how in (("images", made.rgb, cv2.INTER_LINEAR), ("labels", made.labels, cv2.INTER_NEAREST)):
             seen = cv2.remap(image[step, cam], x, y, how)
             file = tmp_path / kind / f"cam_{cam}" / f"frame_{step + 1:05d}.png"

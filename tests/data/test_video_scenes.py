@@ -41,8 +41,8 @@ def distorted(image: np.ndarray, K: np.ndarray, lens) -> np.ndarray:
     y, x = np.mgrid[:height, :width].astype(np.float64)
     own = K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
     points = cv2.undistortPoints(np.stack([x, y], -1).reshape(-1, 1, 2), own, np.array(lens), P=own)
-    place = points.reshape(height, width, 2).astype(np.float32)
-    return cv2.remap(image, place[..., 0], place[..., 1], cv2.INTER_LINEAR)
+    position = points.reshape(height, width, 2).astype(np.float32)
+    return cv2.remap(image, position[..., 0], position[..., 1], cv2.INTER_LINEAR)
 
 
 def write_odd_videos(folder, n_steps=N_LONG, lens=LENS, background=True):
@@ -344,7 +344,7 @@ def test_transforms_name_cameras_by_key_or_path(tmp_path):
 
 
 def test_loss_and_metrics_leave_padding_out(odd, tmp_path, one_thread):
-    """Other colours in pixels that were not filmed change neither the loss nor its gradient, elsewhere they do."""
+    """Other colours in pixels that were not recorded change neither the loss nor its gradient, elsewhere they do."""
     scene = Scene.open(odd[0])
     data, phase = DataConfig(history=1, context_views=2), PhaseConfig(steps=1, horizon=1, target_views=3)
     trainer = Trainer(TrainConfig(data=data, phases=(phase,)), [scene], tmp_path / "run")

@@ -22,7 +22,7 @@ WRITERS = ("genesis", "kubric", "transforms", "videos")
 
 
 def write(folder, layout, monkeypatch, where=(0.0, 0.0, 0.0), moving=False):
-    """The synthetic scene, ``where`` away from its place."""
+    """The synthetic scene, ``where`` away from its position."""
     where = np.asarray(where)
     made = made_scenes.make_scene(moving=moving)
     made.viewmats[..., :3, 3] -= made.viewmats[..., :3, :3] @ where
@@ -121,14 +121,14 @@ def test_simulate_writes_world_coordinates(two, simulator, tmp_path):
 
 def test_edits_take_world_coordinates(two, simulator):
     _, states = two
-    place = np.array([0.3, 0.4, 0.7])
+    position = np.array([0.3, 0.4, 0.7])
     for operation in (
         lambda p: Rotate("all", degrees=30.0, about=tuple(p.tolist())),
         lambda p: Move(Selection("all", (tuple((p - 0.5).tolist()), tuple((p + 0.5).tolist()))), (0.0, 0.0, 1.0)),
         lambda p: Duplicate("all", (1.0, 0.0, 0.0)),
     ):
         a, b = (
-            operation(place + where).apply(state, simulator._colors)
+            operation(position + where).apply(state, simulator._colors)
             for state, where in zip(states, ((0.0, 0.0, 0.0), PLACES[0]))
         )
         torch.testing.assert_close(world(b), world(a) + torch.tensor(PLACES[0]), rtol=0, atol=1e-3)

@@ -134,10 +134,10 @@ def test_spz_of_version_4_is_read(degree, streams, tmp_path):
     given = make(10, degree)
     write_splats(tmp_path / "three.spz", given)
     content = gzip.decompress((tmp_path / "three.spz").read_bytes())
-    sizes, place, parts = [90, 10, 30, 30, 40, 90][:streams], 16, []
+    sizes, begin, parts = [90, 10, 30, 30, 40, 90][:streams], 16, []
     for size in sizes:
-        parts.append(content[place : place + size])
-        place += size
+        parts.append(content[begin : begin + size])
+        begin += size
     packed = [zstandard.ZstdCompressor().compress(part) for part in parts]
     head = content[:4] + struct.pack("<I", 4) + content[8:15] + struct.pack("<BI", streams, 32) + bytes(12)
     table = b"".join(struct.pack("<QQ", len(p), len(part)) for p, part in zip(packed, parts, strict=True))

@@ -270,13 +270,13 @@ def test_write_ply_refuses_gaussians_without_colours(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-PLACES = [(500000.25, 4649776.5, 100.125), (-1e7, 3.5, 0.0), (12345.678, -2.0, 8e5)]
+POSITIONS = [(500000.25, 4649776.5, 100.125), (-1e7, 3.5, 0.0), (12345.678, -2.0, 8e5)]
 
 
 @pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("place", PLACES)
-def test_ply_survey_positions_keep_their_digits(place, form, tmp_path):
-    world = np.array(place) + np.array([[0.0, 0.001, 0.002], [3.0, -2.0, 1.25], [-1.0, 0.1, 0.0]])
+@pytest.mark.parametrize("position", POSITIONS)
+def test_ply_survey_positions_keep_their_digits(position, form, tmp_path):
+    world = np.array(position) + np.array([[0.0, 0.001, 0.002], [3.0, -2.0, 1.25], [-1.0, 0.1, 0.0]])
     properties = [("double", name) for name in "xyz"] + DC + REST
     got = read(tmp_path, rows_of(properties, [[*p, 0.1, 0.2, 0.3, *SHAPE] for p in world.tolist()], form))
     assert got.world_offset.shape == (1, 3) and got.means.abs().max() < 5
@@ -289,9 +289,9 @@ def test_ply_survey_positions_keep_their_digits(place, form, tmp_path):
 
 
 def test_read_ply_offset_is_none_near_the_origin(tmp_path):
-    for kind, place in (("double", (1.5, 2.5, 1e6)), ("float", (5e5, 4649776.0, 1.0)), ("double", (0.1, 0.2, 0.3))):
-        got = read(tmp_path, rows_of([(kind, n) for n in "xyz"] + DC + REST, [[*place, 0, 0, 0, *SHAPE]]))
-        assert got.world_offset is None and got.means[0].tolist() == pytest.approx(place)
+    for kind, position in (("double", (1.5, 2.5, 1e6)), ("float", (5e5, 4649776.0, 1.0)), ("double", (0.1, 0.2, 0.3))):
+        got = read(tmp_path, rows_of([(kind, n) for n in "xyz"] + DC + REST, [[*position, 0, 0, 0, *SHAPE]]))
+        assert got.world_offset is None and got.means[0].tolist() == pytest.approx(position)
 
 
 def test_write_ply_applies_offsets_of_clouds(tmp_path):

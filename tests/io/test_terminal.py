@@ -1,4 +1,4 @@
-"""The command line: text that is safe on a terminal, hints, ranges, places to write, full disks and closed pipes."""
+"""The command line: text that is safe on a terminal, hints, ranges, paths to write, full disks and closed pipes."""
 
 import errno
 import io
@@ -118,10 +118,10 @@ def test_progress_is_hidden_without_terminal(capsys, monkeypatch):
 def test_commands_suggest_near_words(tmp_path, capsys, arguments, message):
     (tmp_path / "config.yaml").write_text("optimizer: {weight_decy: 1}")
     (tmp_path / "effects.yaml").write_text("dynamics: {histroy: 1}")
-    places = {name: tmp_path / f"{name}.yaml" for name in ("config", "effects")} | {"new": tmp_path / "new"}
+    paths = {name: tmp_path / f"{name}.yaml" for name in ("config", "effects")} | {"new": tmp_path / "new"}
     if "{scene}" in arguments:
-        places["scene"] = write_scene(tmp_path / "scene", n_steps=3)
-    assert main([word.format(**places) for word in arguments]) == 2
+        paths["scene"] = write_scene(tmp_path / "scene", n_steps=3)
+    assert main([word.format(**paths) for word in arguments]) == 2
     err = capsys.readouterr().err
     assert err.count("\n") == 1 and re.search(re.sub(r"([?()])", r"\\\1", message), err), err
 
@@ -191,12 +191,9 @@ def test_output_path_makes_folders_and_refuses_files(tmp_path):
     with pytest.raises(InputError, match="exists already"):
         new_output_path(tmp_path / "dangling")
     (tmp_path / "file").write_text("")
-    for place in (
-        lambda: new_output_path(tmp_path / "file" / "b"),
-        lambda: output_path(tmp_path / "file" / "b" / "c.json"),
-    ):
+    for check, name in ((new_output_path, "b"), (output_path, "b/c.json")):
         with pytest.raises(InputError, match="file, which is no folder"):
-            place()
+            check(tmp_path / "file" / name)
     with pytest.raises(InputError, match=r"--export: the name must end in .png; got"):
         output_path(tmp_path / "a.jpg", ".png", "--export")
 

@@ -37,7 +37,7 @@ def test_bound_without_errors_reproduces_the_set(sets, world, monkeypatch):
 
 @pytest.mark.parametrize("world", WORLDS)
 def test_start_errors_have_their_lengths_at_the_last_given_step(world):
-    """Before it and after it bodies fly: places differ by the error of place and that of velocity for each step."""
+    """Positions differ by the error of position, and that of velocity for each step before or after."""
     settings = build_world(world, "published", {**SMALL, "drop_height": (0.9, 0.9), "fps": 42.0})
     drawn, errors = settings.draw("box", 0, 0), ERRORS[world]
     rng = np.random.default_rng(0)

@@ -46,8 +46,8 @@ def ball():
 
 @pytest.fixture(scope="module")
 def motion(ball):
-    (vertices,), (lattice,) = move([ball], 16)
-    return lattice, vertices
+    (vertices,), (grid,) = move([ball], 16)
+    return grid, vertices
 
 
 def test_soft_body_in_free_fall(motion):
@@ -197,7 +197,7 @@ def test_bound_points_equal_the_mesh_at_rest(motion, ball):
 
 
 def test_bindings_reproduce_rigid_motions(motion, ball):
-    points = np.concatenate([ball[0], ball[0] * 1.3 - 0.2])  # also outside the lattice
+    points = np.concatenate([ball[0], ball[0] * 1.3 - 0.2])  # also outside the grid
     particles = np.random.default_rng(0).normal(0, 0.2, (1, 300, 3)) + [0, 0, 0.95]
     axes = np.concatenate([np.zeros((1, 3)), np.eye(3)])[None]
     for tie in (motion[0], embedding.ParticleCloud(particles), embedding.RigidFrame(axes)):

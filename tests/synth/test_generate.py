@@ -80,7 +80,7 @@ def test_generated_scenes_are_read_by_scene(made):
 
 
 def test_generated_states_agree_with_labels(made):
-    """The box of the body's control lattice, projected, holds the body's pixels and is not much larger."""
+    """The box of the body's control grid, projected, holds the body's pixels and is not much larger."""
     for folder in made[1].folders:
         scene = Scene.open(folder)
         states = np.load(folder / "states.npz")["body_0"]
@@ -198,7 +198,7 @@ def test_generate_resumes_after_a_kill(tmp_path):
 
 @pytest.fixture(scope="module")
 def mini_scenes():
-    """First scenes of three jelly bodies, filmed small."""
+    """First scenes of three jelly bodies, rendered small."""
     world = Elastic(image_size=16, n_cams=2, samples=1)
     return world, [world.make(name, 0) for name in ("ball", "box", "torus")]
 
@@ -376,11 +376,11 @@ def test_camera_spread_bounds_the_rigs(tmp_path):
         rig = spread.rig(("ball", sample))
         np.testing.assert_array_equal(rig.viewmats, spread.rig(("ball", sample)).viewmats)
         rotations = rig.viewmats[:, :3, :3]
-        places = -np.einsum("vji,vj->vi", rotations, rig.viewmats[:, :3, 3])
-        aside = np.hypot(*places[:, :2].T)
-        target = places[0, 2] + aside[0] * rotations[0, 2, 2] / np.hypot(*rotations[0, 2, :2])
-        distances.append(np.hypot(aside[0], places[0, 2] - target) / plain.distance), heights.append(target)
-        turns.append(np.arctan2(places[0, 1], places[0, 0]))
+        positions = -np.einsum("vji,vj->vi", rotations, rig.viewmats[:, :3, 3])
+        aside = np.hypot(*positions[:, :2].T)
+        target = positions[0, 2] + aside[0] * rotations[0, 2, 2] / np.hypot(*rotations[0, 2, :2])
+        distances.append(np.hypot(aside[0], positions[0, 2] - target) / plain.distance), heights.append(target)
+        turns.append(np.arctan2(positions[0, 1], positions[0, 0]))
     assert 0.94 <= min(distances) < 0.95 and 1.05 < max(distances) <= 1.06
     height = 0.03 * plain.distance
     assert plain.target_height - height <= min(heights) < plain.target_height - 0.8 * height
@@ -447,7 +447,7 @@ def test_held_out_sets_differ_as_documented(preset, world, subset):
         assert len(bodies) >= 2 and other.n_bodies[1] > train.n_bodies[1]
     if subset == "no-ground":
         assert ground is None and not (np.stack([view.segmentation for view in scene.views]) == 1).any()
-        # Corners of a control lattice that hold nothing may stay behind; of a rigid body the first node is its origin.
+        # Corners of a control grid that hold nothing may stay behind; of a rigid body the first node is its origin.
         heights = scene.states["body_0"][..., 2].reshape(len(scene.views), -1)
         heights = heights[:, :1] if world == "rigid" else heights
         bend = np.median(np.diff(heights, 2, axis=0).mean(0)) * other.fps**2
