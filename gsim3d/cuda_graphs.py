@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from gsim3d.cameras import Cameras
-from gsim3d.dynamics import Background, Parts
+from gsim3d.dynamics import FrozenContext, Partition
 from gsim3d.effects.plan import Plan
 from gsim3d.errors import CaptureError, InputError
 from gsim3d.nn.point_transformer import SparseConv
@@ -205,7 +205,7 @@ class CapturedRollout:
             if parts.nothing_moves:
                 raise InputError("CapturedRollout: state has no row that moves; there is nothing to capture")
             self._state = _own(parts.moving)
-            own = Parts(_own(parts.newest), self._state, _own(parts.background), parts.rows.clone())
+            own = Partition(_own(parts.newest), self._state, _own(parts.background), parts.rows.clone())
             self._rest = _Rest(own, self._remember(parts.background))
         self._moving = self._room_for(int(self._count_moving()))
         self._make_room(self._observed())
@@ -287,7 +287,7 @@ class CapturedRollout:
     def _autocast(self) -> torch.autocast:
         return torch.autocast(self._device.type, self._dtype, enabled=self._dtype is not None, cache_enabled=False)
 
-    def _remember(self, background: Particles) -> Background:
+    def _remember(self, background: Particles) -> FrozenContext:
         with torch.no_grad(), self._autocast():
             return self._model.dynamics.remember(background).with_room(self._factor)
 
@@ -369,7 +369,7 @@ class CapturedRollout:
 
     # ---- what goes in and comes out ----
 
-    def _load_parts(self, parts: Parts) -> Particles:
+    def _load_parts(self, parts: Partition) -> Particles:
         """Takes what rests into the graph's memory; what moves."""
         own = self._rest.parts
         self._check(parts.moving, own.moving.clouds, " in what moves")
@@ -438,8 +438,8 @@ class CapturedRollout:
 class _Rest(NamedTuple):
     """What rests during the rollouts of a graph, in the graph's own memory."""
 
-    parts: Parts
-    background: Background
+    parts: Partition
+    background: FrozenContext
 
 
 def _own(particles: Particles) -> Particles:

@@ -29,9 +29,9 @@ from gsim3d import pretrained
 from gsim3d.cameras import Cameras, Frames, FrameSource, InputSpec
 from gsim3d.cuda_graphs import CapturedRollout
 from gsim3d.dynamics import (
-    Background,
     Dynamics,
-    Parts,
+    FrozenContext,
+    Partition,
     RestLog,
     Sleepers,
     append_step,
@@ -40,7 +40,6 @@ from gsim3d.dynamics import (
     rollout,
     rollout_in_parts,
 )
-from gsim3d.dynamics.follow import follow
 from gsim3d.effects.edits import Edit, by_step
 from gsim3d.effects.plan import Plan, make_plan, unused_parameters
 from gsim3d.effects.selection import any_mask
@@ -236,14 +235,8 @@ class Simulator(nn.Module):
         if spoiled is not None:
             particles = drop_particles(particles, pixel_rows(frames, spoiled, shapes))
         particles = guard(particles)
-        particles = self.dynamics.with_bodies(particles)
-        if (dynamics := self.config.dynamics).velocity:
-            n_views = None if shapes is None else len(frames.cameras) // particles.n_clouds
-            flight = self.dynamics.flight(particles)
-            sizes = dynamics.motion_length, dynamics.grid_size, 2**dynamics.history_bits
-            velocity = follow(particles, frames, *sizes, n_views, flight and flight.falls)
-            particles = dataclasses.replace(particles, velocity=velocity)
-        particles = self.dynamics.in_light(particles)
+        n_views = None if shapes is None else len(frames.cameras) // particles.n_clouds
+        particles = self.dynamics.observe(particles, frames, n_views)
         guard.keywords["report"].send()
         return particles
 
@@ -350,7 +343,7 @@ class Simulator(nn.Module):
             for edit in changes.get(begin, ()):
                 state = edit.apply(state, self._colors)
             if begin in changes:
-                state = self.dynamics.in_light(state)
+                state = self.dynamics.initialize(state)
             state = guard(state)
             steps += self._roll(predict, state, end - begin, plan, generator, log)
             if end < n_steps:
@@ -391,18 +384,18 @@ class Simulator(nn.Module):
         if background == "dynamic":
             state = dataclasses.replace(state, activity=torch.where(state.activity == FROZEN, DYNAMIC, state.activity))
         state = last_steps(state, plan.history)
-        return self.dynamics.begin(self.dynamics.in_light(state))
+        return self.dynamics.begin(self.dynamics.initialize(state))
 
     def _parts(
         self, prepared: Particles, *, on_invalid: OnInvalid | None = None, report: StabilityReport | None = None
-    ) -> Parts:
+    ) -> Partition:
         """What moves and what rests of a state of :meth:`_prepare`, for a model with an asymmetric background."""
-        return Parts.of(self._guard("rollout", on_invalid, report)(prepared), asymmetric=True)
+        return Partition.of(self._guard("rollout", on_invalid, report)(prepared), asymmetric=True)
 
     def _advance(
         self,
         moving: Particles,
-        background: Background,
+        background: FrozenContext,
         n_steps: int,
         plan: Plan,
         *,
@@ -539,7 +532,7 @@ class Simulator(nn.Module):
     def _predict(
         self,
         state: Particles,
-        background: Background | None = None,
+        background: FrozenContext | None = None,
         *,
         plan: Plan,
         generator: torch.Generator | None,

@@ -15,6 +15,7 @@ from gsim3d.errors import CaptureError, InputError, NumericalError
 from gsim3d.numerics.policy import StabilityConfig
 from gsim3d.numerics.report import StabilityReport
 from gsim3d.ops import PyramidCapacity
+from gsim3d.priors import InertiaConfig, ProximityConfig, ShapeMatchingConfig
 from gsim3d.simulator import Simulator
 from gsim3d.state import DYNAMIC, FROZEN, constant, keeping_constants
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
@@ -86,8 +87,8 @@ def test_a_graph_repeats_the_rollout_with_other_particles(n_steps, changes, devi
 
 
 def test_a_graph_makes_room_where_more_rows_may_move(device):
-    told = {"motion_length": 0.2, "velocity": True, "deformation": True, "contact_length": 0.1}
-    simulator = make_simulator(device, dynamics=dataclasses.replace(CONFIG.dynamics, **told))
+    priors = ProximityConfig(range=0.1), InertiaConfig(radius=0.2), ShapeMatchingConfig(radius=0.2)
+    simulator = make_simulator(device, dynamics=dataclasses.replace(CONFIG.dynamics, priors=priors))
     state = make_state(device=device)
     moves = state.activity == DYNAMIC
     newest = torch.arange(state.n_rows, device=device) >= state.clouds.starts[-2]

@@ -12,7 +12,7 @@ ROOT = Path(__file__).parent.parent
 RINGS = {
     "library": """
         errors effects numerics
-        numerics.policy numerics.report compat.checkpoints
+        numerics.policy numerics.report
         io.terminal io.plain io.pickles io.locks
         cameras
         state
@@ -24,10 +24,9 @@ RINGS = {
         numerics.validate effects.selection
         effects.spec
         nn
-        dynamics.config dynamics.background
-        nn.point_transformer
+        priors
         dynamics
-        io
+        compat.checkpoints io
         effects.edits
         presets
         effects.plan numerics.speed pretrained.loading

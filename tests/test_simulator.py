@@ -13,12 +13,14 @@ from gsim3d.dynamics import last_steps
 from gsim3d.effects.spec import AppearanceEffects, DynamicsEffects, EffectsSpec, UnsupportedEffect
 from gsim3d.nn.gaussian_head import RendererConfig, render
 from gsim3d.presets import ModelConfig
+from gsim3d.priors import GravityConfig, InertiaConfig, ProximityConfig, ShapeMatchingConfig, VelocityFromImagesConfig
 from gsim3d.simulator import Simulator
 from gsim3d.state import DYNAMIC, FROZEN
 from gsim3d.train.loop import deterministic
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, with_threads
 from tests.dynamics.scenes import TINY
 from tests.nn.multiview_encoder.scenes import CONFIG as TINY_ENCODER
+from tests.priors.scenes import OCCLUSION
 
 SIZE = 16
 ENCODER = dataclasses.replace(TINY_ENCODER, transformer_layers=1, upsampled_dim=4, dynamic_dim=4, static_dim=3)
@@ -95,7 +97,8 @@ def test_encode_step_rollout_render():
 
 def test_encoded_particles_know_how_fast_they_are_and_what_stands_in_their_light():
     """Velocities come from no step that is older than the longest history, here of four."""
-    seeing = dataclasses.replace(CONFIG.dynamics, motion_length=0.5, velocity=True, lights=((0.0, 0.0, 1.0),))
+    priors = VelocityFromImagesConfig(radius=0.5), InertiaConfig(radius=0.5), OCCLUSION
+    seeing = dataclasses.replace(CONFIG.dynamics, priors=priors)
     simulator, frames = make_simulator(dataclasses.replace(CONFIG, dynamics=seeing)), make_frames((3,))
     in_history, too_old = (
         simulator.encode(dataclasses.replace(frames, cloud_step=torch.tensor([0, last - 1, last]))) for last in (3, 4)
@@ -118,25 +121,27 @@ def test_encoded_particles_know_how_fast_they_are_and_what_stands_in_their_light
 def test_with_gravity_encoded_particles_in_flight_are_as_fast_as_in_their_last_step():
     """Not as on average over the three steps that were given; those that touch something are."""
     fall = (0.0, 0.002, -0.01)
-    more = {"motion_length": 0.1, "velocity": True, "deformation": True, "contact_length": 0.05}
+    priors = VelocityFromImagesConfig(radius=0.1), ProximityConfig(range=0.05), InertiaConfig(radius=0.1)
     states = []
-    for gravity in (None, fall):
-        config = dataclasses.replace(CONFIG.dynamics, **more, gravity=gravity)
+    for gravity in ((), (GravityConfig(acceleration=fall, radius=0.1),)):
+        config = dataclasses.replace(CONFIG.dynamics, priors=priors + gravity)
         simulator = make_simulator(dataclasses.replace(CONFIG, dynamics=config))
         states.append(simulator.encode(make_frames((3,))))
     newest = states[0].row_cloud() == 2
-    flight, moves = simulator.dynamics.flight(states[1]), states[0].activity[newest] == DYNAMIC
-    assert (flight.touch[moves] < 0.5).any() and (flight.touch[moves] == 1).any()
+    gravity, ctx = simulator.dynamics.priors.get("gravity"), simulator.dynamics.context(states[1])
+    touch, moves = gravity.touch(ctx), states[0].activity[newest] == DYNAMIC
+    assert (touch[moves] < 0.5).any() and (touch[moves] == 1).any()
     faster = (states[1].velocity - states[0].velocity)[newest][moves]
-    torch.testing.assert_close(faster, 0.5 * flight.falls[moves], atol=1e-5, rtol=1e-3)
-    assert flight.gravity.tolist() == pytest.approx(fall)
+    torch.testing.assert_close(faster, 0.5 * gravity.fall(ctx)[moves], atol=1e-5, rtol=1e-3)
+    assert gravity.step.tolist() == pytest.approx(fall)
 
 
 @pytest.mark.parametrize("name", ["means", "dynamic_latents"])
 @pytest.mark.parametrize("activity", [DYNAMIC, FROZEN])
 def test_what_a_broken_row_remembers_is_not_used(name, activity):
-    more = {"motion_length": 0.5, "deformation": True, "lights": ((0.0, 0.0, 1.0),), "background": "relightable"}
-    config = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, **more))
+    priors = InertiaConfig(radius=0.5), ShapeMatchingConfig(radius=0.5), OCCLUSION
+    dynamics = dataclasses.replace(CONFIG.dynamics, priors=priors, background="relightable")
+    config = dataclasses.replace(CONFIG, dynamics=dynamics)
     simulator, frames = awake(make_simulator(config)), make_frames()
     plan = simulator.plan(EffectsSpec(appearance=AppearanceEffects(changing="all")))
     state = simulator.encode(frames)

@@ -11,7 +11,7 @@ import re
 import torch
 from torch import Tensor
 
-from gsim3d.dynamics.state import StateLayout
+from gsim3d.dynamics.step import StateLayout
 from gsim3d.math.spherical_harmonics import rotate_harmonics
 from gsim3d.presets import ModelConfig
 

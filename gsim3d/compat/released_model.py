@@ -44,7 +44,7 @@ HARMONIC_14 = 1.445305721320277  # its factor
 Module = TypeVar("Module", bound=nn.Module)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ReleasedDynamicsConfig(DynamicsConfig):
     """Cells are counted from the smallest position of a call and curves are as deep as its clouds are large, so clouds
     change each other; time slots count from the first step; opacities have no upper limit; frozen particles keep their
@@ -52,7 +52,7 @@ class ReleasedDynamicsConfig(DynamicsConfig):
 
     def __post_init__(self):
         super().__post_init__()
-        if self.background != "symmetric" or self.motion_length or self.contact_length or self.lights:
+        if self.background != "symmetric" or self.priors:
             raise ValueError('ReleasedDynamicsConfig: background must be "symmetric", and nothing beside the network')
 
     @property

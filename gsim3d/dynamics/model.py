@@ -5,29 +5,22 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from gsim3d import ops
-from gsim3d.dynamics.background import Background
-from gsim3d.dynamics.bodies import bodies
+from gsim3d.cameras import Frames
 from gsim3d.dynamics.config import DynamicsConfig
-from gsim3d.dynamics.contact import FIRM, SOLID, Beside
-from gsim3d.dynamics.daylight import daylight
-from gsim3d.dynamics.deformation import deformation
-from gsim3d.dynamics.flight import Flight
-from gsim3d.dynamics.matter import Matter
-from gsim3d.dynamics.momentum import momentum, turned
-from gsim3d.dynamics.motion import motion
-from gsim3d.dynamics.parts import Parts
-from gsim3d.dynamics.push import Pushes
-from gsim3d.dynamics.shade import shade
-from gsim3d.dynamics.state import LIGHT_CHANNELS, StateLayout
+from gsim3d.dynamics.frozen_context import FrozenContext
+from gsim3d.dynamics.partition import Partition
+from gsim3d.dynamics.step import StateLayout
 from gsim3d.nn.point_transformer import PointTransformer
 from gsim3d.ops.curve import Pyramid, PyramidCapacity
+from gsim3d.priors import Motion, StepContext
+from gsim3d.priors.base import put_runs
 from gsim3d.state import (
     ASLEEP,
     FROZEN,
@@ -37,52 +30,35 @@ from gsim3d.state import (
     constant,
     newest_clouds,
     single_steps,
-    take_runs,
     with_attribute,
 )
 
-ROOM = 1.1  # for rows that a call reads, over what was counted
-LIGHT_SIZE = 0.1  # of the parameter that is a direction: smaller ones are turned faster in training
-DIMMING = 0.2  # logarithm of how much darker a row is where log(1 + n) of the matter before its lamp grows by one
-GRAVITY_SIZE = 0.01  # metres a step, of every step: of the parameter's unit, so that training changes it little
-SKIN, SKIN_SIZE = 0.02, 0.1  # metres, where it begins; and its unit, likewise
-STEADY = 20.0  # as LIGHT_SIZE, of lamps that light surfaces: training turned them away from the true ones
-STRENGTH = 2.0  # of the light that a surface facing the lamp gets, over that which comes from everywhere
+SLACK = 1.1  # for particles that a call reads, over what was counted
 
 
 class Dynamics(nn.Module):
     """Predicts how particles change in one step.
 
-    The network reads all steps of a history at once; each row of the newest step gets an increment. Steps are counted
-    back from the newest, so one model serves any history of 1 to ``2 ** config.history_bits`` steps. Scenes do not
-    change each other (in training with ``norm="batch"`` they do). Rows that are asleep, outside the 2^16 cells from the
-    scene's origin, or at no finite place, keep their state and nobody sees them.
+    The network reads all steps of a history together; each particle of the newest step gets an increment, and priors
+    (:mod:`gsim3d.priors`) move particles besides. Steps are counted back from the newest, so one model serves any
+    history of 1 to ``2 ** config.history_bits`` steps. Scenes do not change each other (in training with
+    ``norm="batch"`` they do). Particles that are asleep, outside the 2^16 cells from the scene's origin, or at no
+    finite position, keep their state and are not seen by others.
+
+    Attributes:
+        priors: of the model, in order.
+        layout: of the network's inputs and outputs.
+        rounds: whether geometry is rounded in training; None: on a GPU.
     """
 
     def __init__(self, config: DynamicsConfig):
         super().__init__()
-        self.config = config
-        self.layout = StateLayout.of(config)
-        self.rounds = None  # whether geometry is rounded in training; None: on a GPU
-        self._most_moving: int | None = None
-        layout = self.layout
-        self.net = PointTransformer(layout.in_channels, layout.told_channels, layout.out_channels, config)
-        self.lights = self.dimming = self.strength = None
-        if config.lights:
-            directions, each = torch.tensor(config.lights), (len(config.lights), LIGHT_CHANNELS)
-            if config.surfaces:
-                self.lights = nn.Parameter(STEADY * F.normalize(directions, dim=1))
-                self.strength = nn.Parameter(torch.full(each, STRENGTH))
-            else:
-                self.lights = nn.Parameter(LIGHT_SIZE * directions)
-                self.dimming = nn.Parameter(torch.full(each, DIMMING))
-        self.gravity = None
-        if config.gravity is not None:
-            self.gravity = nn.Parameter(torch.tensor(config.gravity) / GRAVITY_SIZE)
-        self.friction = self.skin = None
-        if config.pushes:
-            self.friction = nn.Parameter(torch.ones(()))
-            self.skin = nn.Parameter(torch.tensor(SKIN / SKIN_SIZE))
+        self.config, self.priors, self.rounds = config, config.build_priors(), None
+        self._most_movable: int | None = None
+        self.layout = StateLayout.of(config, self.priors)
+        for prior in self.priors:
+            prior.connect(config.encoder_channels[0], config.out_channels)
+        self.net = PointTransformer(self.layout.in_channels, self.layout.out_channels, config, tuple(self.priors))
 
     def geometry(
         self,
@@ -110,7 +86,7 @@ class Dynamics(nn.Module):
         if capacity is not None:
             options["capacity"] = capacity = capacity.of_rows(history.n_rows)
         if capacity is not None and capacity.sizes[0] < history.n_rows:
-            chosen, cu_rows, is_row, n_seen = _packed(seen, cu_rows, capacity.sizes[0])
+            chosen, cu_rows, is_row, n_seen = _seen_first(seen, cu_rows, capacity.sizes[0])
             places = torch.where(is_row[:, None], places[chosen], torch.nan)
         pyramid = ops.build_pyramid(
             places,
@@ -127,21 +103,21 @@ class Dynamics(nn.Module):
     def moving_at_most(self, n_rows: int) -> Iterator[None]:
         """Within it no scene has more rows that may move than ``n_rows``: a GPU computes what is told of these alone,
         as a CPU does that counts them."""
-        before, self._most_moving = self._most_moving, n_rows
+        before, self._most_movable = self._most_movable, n_rows
         try:
             yield
         finally:
-            self._most_moving = before
+            self._most_movable = before
 
     def room(self, history: Particles) -> int:
         """Rows that the network needs room for in calls like that of ``history``: with a background that is relit only
         those that it sees, which waits for the device."""
         if not self.config.is_relightable:
             return history.n_rows
-        return min(history.n_rows, math.ceil(ROOM * int(self._seen(history).sum())))
+        return min(history.n_rows, math.ceil(SLACK * int(self._seen(history).sum())))
 
-    def remember(self, background: Particles, *, generator: torch.Generator | None = None) -> Background:
-        """What moving rows read of a background, for all calls until it changes.
+    def remember(self, background: Particles, *, generator: torch.Generator | None = None) -> FrozenContext:
+        """What moving particles read of a background, for all calls until it changes.
 
         Args:
             background: at most one cloud a scene.
@@ -150,60 +126,39 @@ class Dynamics(nn.Module):
         """
         curves = self._draw_curves(generator)
         pyramid = self.geometry(background, curves=curves)
-        remembered, recorders = Background.begin(pyramid, background, self.config.pyramid_spec(0), curves)
+        context, recorders = FrozenContext.begin(pyramid, background, self.config.pyramid_spec(0), curves)
         if recorders:
-            draws = generator if self.training else None
-            x = ops.pool_mean(self.layout.pack(background), pyramid.rows, pyramid.cu_rows, check=False)
-            self.net(x, pyramid, generator=draws and _beside(draws, x.device), besides=recorders)
-        return remembered
+            base = self.layout.pack(background)
+            further = sum(prior.n_conv_features + prior.n_features for prior in self.priors)
+            x = torch.cat([base, base.new_zeros(len(base), further)], 1)  # priors see movable particles only
+            x = ops.pool_mean(x, pyramid.rows, pyramid.cu_rows, check=False)
+            self.net(x, pyramid, generator=self._draws(generator, x.device), contexts=recorders)
+        return context
 
-    @torch.no_grad()
-    def in_light(self, particles: Particles) -> Particles:
-        """``particles`` of which the newest clouds know what stands in their light; where they do not know what stood
-        there as they were encoded, that is what stands there now."""
-        if self.lights is None:
-            return particles
-        runs = particles.clouds.row_runs(newest_clouds(particles.clouds))
-        known = None if particles.light_occlusion is None else take_runs(particles.light_occlusion, runs)
-        shaded = self._shaded(particles, known)
-        return dataclasses.replace(particles, light_occlusion=_put_runs(shaded, runs, particles.n_rows, -1.0))
+    def observe(self, particles: Particles, frames: Frames, n_views: int | None = None) -> Particles:
+        """``particles``, which were encoded from ``frames``, with what priors read off both.
 
-    def with_bodies(self, particles: Particles) -> Particles:
-        """``particles`` of which the newest clouds know their bodies, if that is asked for; others know no more than
-        where they are."""
-        if not self.config.pushes or particles.body is not None:
-            return particles
-        runs = particles.clouds.row_runs(newest_clouds(particles.clouds))
-        here = with_attribute(particles, "body").body
-        found = bodies(particles, self.config.grid_size)
-        newest = _put_runs(torch.ones_like(found[:, :1], dtype=torch.bool), runs, particles.n_rows)
-        return dataclasses.replace(particles, body=torch.where(newest, _put_runs(found, runs, particles.n_rows), here))
-
-    def flight(self, history: Particles, matter: Matter | None = None, beside: Beside | None = None) -> Flight | None:
-        """How far the rows of the newest clouds are from flying; None of a model without ``gravity``.
-
-        matter, beside: of ``history``; None: found here.
+        n_views: images of every cloud, which follow each other, cloud by cloud; nothing then waits for the device.
         """
-        if self.gravity is None:
-            return None
-        matter = matter or self._matter(history)
-        beside = beside or self._beside(history, matter)
-        pushes = None
-        if self.friction is not None and matter is not None:
-            numbers = self.friction, SKIN_SIZE * self.skin
-            pushes = Pushes(history, matter, beside, self.config.motion_length, *numbers, self.config.solid)
-        return Flight.of(beside.contact[:, -1:], matter, GRAVITY_SIZE * self.gravity, pushes)
+        for prior in self.priors:
+            ctx = self.context(particles)
+            ctx.n_views = n_views
+            particles = prior.initialize(particles, ctx, frames)
+        return particles
 
-    def begin(self, state: Particles) -> Particles:
-        """``state`` with the fields in which simulated rows know how they began."""
+    def initialize(self, particles: Particles) -> Particles:
+        """``particles`` with what priors know of them, at the start of a rollout or after an edit."""
+        for prior in self.priors:
+            particles = prior.initialize(particles, self.context(particles))
+        return particles
+
+    def begin(self, particles: Particles) -> Particles:
+        """``particles`` with the attributes that a step reads; absent ones begin here."""
         if self.config.is_relightable:
-            state = with_attribute(state, "initial_latents")
-        if self.config.deformation:
-            state = with_attribute(state, "rest_positions")
-        if self.config.turning:
-            state = with_attribute(state, "orientations")
-        state = self.with_bodies(state)
-        return state if self.lights is None else with_attribute(state, "irradiance_gain")
+            particles = with_attribute(particles, "initial_latents")
+        for prior in self.priors:
+            particles = prior.begin(particles, self.context(particles))
+        return particles
 
     def forward(
         self,
@@ -211,148 +166,111 @@ class Dynamics(nn.Module):
         *,
         generator: torch.Generator | None = None,
         pyramid: Pyramid | None = None,
-        background: Background | None = None,
+        background: FrozenContext | None = None,
         changes: Mapping[str, str] | None = None,
     ) -> Particles:
         """The next step of every scene, or the next ``config.steps_per_call`` steps.
 
         Args:
-            history: clouds sorted by (scene, step); steps may have different numbers of rows, and gaps are fine. What
-                stands in the light of the newest ones is known (:meth:`in_light`), or of none.
+            history: clouds sorted by (scene, step); steps may have different numbers of particles, and gaps are fine.
             generator: of drop path and of the curves' shuffling, both in training only; None: neither happens.
             pyramid: ``geometry(history)``; None: made here. With one of a given capacity nothing waits for the device,
                 and the result has the same values as long as ``pyramid.found`` fits the capacity.
-            background: what rests, of :meth:`remember`; then ``history`` holds what moves, as :class:`Parts` tells them
-                apart. None: with ``config.background="asymmetric"`` all that is done here.
+            background: static particles, of :meth:`remember`; then ``history`` holds the moving ones of a
+                :class:`Partition`. None: with ``config.background="asymmetric"`` all that is done here.
             changes: what a step changes, of ``layout.changes``; the rest is not computed. None: all that is predicted.
         Returns:
-            One cloud a scene and step, each with the rows of the scene's newest step.
+            One cloud a scene and step, each with the particles of the scene's newest step.
         Gradients: features and positions of ``history``, parameters. Cells are constants.
         Raises:
             ValueError: clouds are not sorted, a history is longer than the model's, or a model with ``norm="batch"`` is
-                trained on a pyramid of given capacity: its statistics would count rows that are none.
+                trained on a pyramid of given capacity: its statistics would count padding.
         """
         changes = changes or self.layout.changes()
         if background is None and self.config.is_asymmetric:
             return self._forward_in_parts(history, generator, changes)
-        history = self.begin(history if history.light_occlusion is not None else self.in_light(history))
-        if self.config.is_relightable:
-            history = _as_it_began(history, changes["dynamic_latents"] in ("all", "dynamic"))
-        clouds = history.clouds
-        newest = newest_clouds(clouds)
+        history = self._as_it_began(self.begin(history), changes)
         if pyramid is None:
             curves = None if background is None else background.curves
             rounded = background is None and self._rounds(history)
             pyramid = self.geometry(history, generator=generator, curves=curves, rounded=rounded)
-        n_data = [stage.n_data for stage in pyramid.stages]
+        ctx = self.context(history, changes)
+        outputs, gains = self._predict(ctx, pyramid, generator, background)
+        displacements = self.layout.displacements(ctx.state, outputs)
+        if any(prior.acts for prior in self.priors) and not ctx.is_empty:
+            displacements = self._move(ctx, displacements[0], gains)[None]
+        steps = self.layout.advance(ctx.state, outputs, displacements, ctx.awake, changes)
+        if not ctx.is_empty:
+            for prior in self.priors:
+                steps = [prior.finish(step, gains.get(prior.name), ctx) for step in steps]
+        steps = [_later(step, 1 + i) for i, step in enumerate(steps)]
+        return steps[0] if len(steps) == 1 else concatenate(steps)
+
+    def _move(self, ctx: StepContext, network: Tensor, gains: Mapping[str, Tensor]) -> Tensor:
+        """[N, 3] metres, the displacement of a step with priors."""
+        motion = Motion.of_network(network)
+        for prior in self.priors:
+            motion = prior.move(motion, gains.get(prior.name), ctx)
+        most = math.inf if self.config.max_step is None else self.config.max_step
+        return motion.total().clamp(-most, most)
+
+    def _predict(
+        self, ctx: StepContext, pyramid: Pyramid, generator: torch.Generator | None, background: FrozenContext | None
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Outputs and gains of the network for the newest particles, as :meth:`StateLayout.split` returns them."""
+        history, n_data = ctx.history, [stage.n_data for stage in pyramid.stages]
         if pyramid.found is not None and self.training and self.config.norm == "batch" and None in n_data:
             raise ValueError(
                 'Dynamics: norm="batch" cannot be trained with a pyramid of given capacity; use norm="layer"'
             )
-        runs, config = clouds.row_runs(newest), self.config
-        moved = drift = near = flight = dark = shaded = None
-        matter = self._matter(history)
-        if config.velocity:
-            drift = momentum(history, config.motion_length, config.grid_size, matter)
-        elif config.motion_length is not None:
-            drift = motion(history, config.motion_length, config.grid_size)
-        if config.deformation:
-            bent = deformation(history, config.motion_length, config.grid_size, matter)
-            drift = torch.cat([drift, bent[:, None].to(drift.dtype)], 1)
-        if drift is not None:
-            moved = _put_runs(drift, runs, history.n_rows)
-        if config.contact_length is not None:
-            beside = self._beside(history, matter)
-            flight = self.flight(history, matter, beside)
-            near = _put_runs(beside.contact, runs, history.n_rows)
-        if self.lights is not None:
-            shaded, n_lights = take_runs(history.light_occlusion, runs), len(self.lights)
-            dark = torch.cat([shaded[:, -n_lights:], shaded[:, :n_lights]], 1)  # now and then
-            dark = _put_runs(dark, runs, history.n_rows)
-        features, is_awake = self.layout.pack(history, moved, near, dark), None
-        n_awake = pyramid.rows.shape[0] if pyramid.found is None else n_data[0]
-        everyone = n_awake == history.n_rows
-        if not everyone:  # rows of the pyramid <-> rows of the history; those that sleep become 0
-            features = ops.pool_mean(features, pyramid.rows, pyramid.cu_rows, check=False)
-        draws = generator if self.training else None
-        besides = () if background is None else background.readers(pyramid, history)
-        features = self.net(features, pyramid, generator=draws and _beside(draws, features.device), besides=besides)
-        if not everyone:
-            one = features.new_ones(features.shape[0], 1)
-            features, is_awake = (
-                ops.unpool(x, pyramid.rows, pyramid.cu_rows, history.n_rows, check=False) for x in (features, one)
+        x = self._features(ctx)
+        n_seen = pyramid.rows.shape[0] if pyramid.found is None else n_data[0]
+        all_seen = n_seen == history.n_rows
+        if not all_seen:  # rows of the pyramid <-> rows of the history; those that sleep become 0
+            x = ops.pool_mean(x, pyramid.rows, pyramid.cu_rows, check=False)
+        contexts = () if background is None else background.readers(pyramid, history)
+        x = self.net(x, pyramid, generator=self._draws(generator, x.device), contexts=contexts)
+        if not all_seen:
+            one = x.new_ones(x.shape[0], 1)
+            x, seen = (
+                ops.unpool(values, pyramid.rows, pyramid.cu_rows, history.n_rows, check=False) for values in (x, one)
             )
-        prediction = self.net.head(take_runs(features, runs), self.layout.columns(changes))
-        if is_awake is not None:
-            is_awake = take_runs(is_awake, runs)[:, 0] > 0
+            ctx.awake = ctx.of_newest(seen)[:, 0] > 0
+        prediction = self.net.head(ctx.of_newest(x), self.layout.columns(ctx.changes))
+        return self.layout.split(prediction, ctx.changes)
 
-        state = history.select_clouds(newest)
-        table = state.clouds
-        counts = [table.count(q) for q in range(len(table))]
-        steps = [
-            step.with_clouds(
-                CloudTable.make(counts, table.scenes, (s + 1 + i for s in table.steps), state.cu_rows.device)
-            )
-            for i, step in enumerate(self.layout.advance(state, prediction, is_awake, changes, drift, flight))
-        ]
-        if config.velocity:
-            steps = [
-                dataclasses.replace(step, velocity=step.means - before.means)
-                for before, step in zip([state, *steps], steps)
-            ]
-        if config.turning:
-            turns = turned(state.orientations, steps[0].velocity, config.motion_length, matter)
-            steps = [dataclasses.replace(steps[0], orientations=turns)]
-        if self.lights is not None:
-            # Where rows have come to: with the light of where they were shadows would lag behind their bodies.
-            found = [self._shaded(step, shaded) for step in steps]
-            brighter = torch.stack([self._brighter(values) for values in found])
-            light = self.layout.later_light(state, prediction, brighter, is_awake, changes)
-            steps = [
-                dataclasses.replace(step, light_occlusion=values, irradiance_gain=lit)
-                for step, values, lit in zip(steps, found, light.unbind(0), strict=True)
-            ]
-        return steps[0] if len(steps) == 1 else concatenate(steps)
+    def _features(self, ctx: StepContext) -> Tensor:
+        """[M, channels] of all particles of the history: own, of priors convolved, of priors read one by one."""
+        columns = [self.layout.pack(ctx.history)]
+        for width, features in (("n_conv_features", "conv_features"), ("n_features", "features")):
+            for prior in self.priors:
+                if n := getattr(prior, width):
+                    made = None if ctx.is_empty else getattr(prior, features)(ctx)
+                    columns.append(columns[0].new_zeros(len(columns[0]), n) if made is None else made)
+        return torch.cat(columns, 1)
 
-    def _shaded(self, particles: Particles, known: Tensor | None) -> Tensor:
-        """Of the newest rows: what stood in the light of each lamp where they were encoded, with ``surfaces`` how much
-        they faced it there, and what stands there now. The former are ``known``, as far as they are not negative; rows
-        that sleep keep what they knew."""
-        n_lights, grid_size = len(self.lights), self.config.grid_size
-        matter = Matter.of(particles, grid_size, most=self._most_moving)
-        if self.config.surfaces:
-            facing = None if known is None else known[:, n_lights : 2 * n_lights]
-            facing = None if facing is None else torch.where(facing < 0, 1.0, facing)
-            now, faces = daylight(particles, self.lights, grid_size, matter, facing)
-            began = torch.cat([now, faces], 1)
-        else:
-            now = began = shade(particles, self.lights, grid_size, matter)
-        if known is not None and matter is not None:
-            before = known[:, -n_lights:]
-            now = torch.where(matter.awake(particles)[:, None] | (before < 0), now, before)
-            known = known[:, : began.shape[1]]
-            began = torch.where(known < 0, began, known)
-        return torch.cat([began, now], 1)
+    def context(self, particles: Particles, changes: Mapping[str, str] | None = None) -> StepContext:
+        """What the priors share in a step from ``particles``."""
+        config, most = self.config, self._most_movable
+        sizes = config.grid_size, 2**config.history_bits
+        return StepContext(particles, self.priors, *sizes, most_movable=most, changes=changes, share=self.layout.share)
 
-    def _brighter(self, shaded: Tensor) -> Tensor:
-        """[N, 3], logarithm of how much more light reaches rows now than where they were encoded."""
-        before, now = shaded[:, : len(self.lights)], shaded[:, -len(self.lights) :]
-        if not self.config.surfaces:
-            return ((before - now)[:, :, None] * self.dimming).sum(1)  # a product of matrices would be rounded
-        now, then = ((lit[:, :, None] * self.strength.clamp(min=0)).sum(1).log1p() for lit in (now, before))
-        return now - then
+    def _as_it_began(self, history: Particles, changes: Mapping[str, str]) -> Particles:
+        """For a relightable background: ``history`` whose frozen particles look as when the simulation began, and where
+        latents of bodies change, all of them."""
+        if not self.config.is_relightable:
+            return history
+        bodies = changes["dynamic_latents"] in ("all", "dynamic")
+        as_began = ((history.activity == FROZEN) | bodies & (history.activity != ASLEEP))[:, None]
+        latents = torch.where(as_began, history.initial_latents, history.dynamic_latents)
+        return dataclasses.replace(history, dynamic_latents=latents)
 
-    def _matter(self, history: Particles) -> Matter | None:
-        """What all that rows are told begins with; None where nothing is told of it."""
-        config = self.config
-        if config.velocity or config.deformation:
-            return Matter.of(history, config.grid_size, config.motion_length, self._most_moving, evenly=config.pushes)
-        if config.contact_length is not None:
-            return Matter.of(history, config.grid_size, most=self._most_moving)
-        return None
-
-    def _beside(self, history: Particles, matter: Matter | None) -> Beside:
-        return Beside(history, self.config.contact_length, matter, FIRM if self.config.pushes else SOLID)
+    def _draws(self, generator: torch.Generator | None, device: torch.device) -> torch.Generator | None:
+        """In training ``generator``, or one on ``device`` that follows from it: a GPU would wait for host draws."""
+        if not self.training or generator is None or generator.device.type == device.type:
+            return generator if self.training else None
+        seed = torch.randint(2**62, (), generator=generator, device=generator.device).item()
+        return torch.Generator(device).manual_seed(seed)
 
     def _seen(self, history: Particles) -> Tensor:
         """bool [N], rows that the network sees."""
@@ -360,7 +278,7 @@ class Dynamics(nn.Module):
         if self.config.is_relightable:
             runs = history.clouds.row_runs(newest_clouds(history.clouds))
             newest = torch.ones_like(seen[: sum(end - begin for begin, end in runs)])
-            seen = seen & ((history.activity != FROZEN) | _put_runs(newest, runs, history.n_rows))
+            seen = seen & ((history.activity != FROZEN) | put_runs(newest, runs, history.n_rows))
         return seen
 
     def _rounds(self, history: Particles) -> bool:
@@ -371,16 +289,16 @@ class Dynamics(nn.Module):
         return self.training and history.means.is_cuda if self.rounds is None else self.rounds
 
     def _forward_in_parts(
-        self, history: Particles, generator: torch.Generator | None, changes: Mapping[str, str] | None
+        self, history: Particles, generator: torch.Generator | None, changes: Mapping[str, str]
     ) -> Particles:
-        parts, n_steps = Parts.of(history, asymmetric=True), self.config.steps_per_call
+        parts, n_steps = Partition.of(history, asymmetric=True), self.config.steps_per_call
         steps = [None] * n_steps
         if not parts.nothing_moves:
             background = self.remember(parts.background, generator=generator)
             step = self(parts.moving, generator=generator, background=background, changes=changes)
             steps = single_steps(step)
-        wholes = [parts.whole(step, 1 + i) for i, step in enumerate(steps)]
-        return wholes[0] if n_steps == 1 else concatenate(wholes)
+        steps = [parts.whole(step, 1 + i) for i, step in enumerate(steps)]
+        return steps[0] if n_steps == 1 else concatenate(steps)
 
     def _slots(self, clouds: CloudTable, newest: list[int]) -> tuple[tuple[int, ...], int]:
         """Time slot of each cloud, and the bits they are counted in: none where no scene has two steps to merge."""
@@ -407,34 +325,18 @@ class Dynamics(nn.Module):
         )
 
 
-def _beside(generator: torch.Generator, device: torch.device) -> torch.Generator:
-    """``generator``, or one on ``device`` that follows from it: a GPU would wait for rows drawn on the host."""
-    if generator.device.type == device.type:
-        return generator
-    seed = torch.randint(2**62, (), generator=generator, device=generator.device).item()
-    return torch.Generator(device).manual_seed(seed)
+def _later(particles: Particles, n_steps: int) -> Particles:
+    """The same values as of ``n_steps`` steps later."""
+    table = particles.clouds
+    counts = [table.count(q) for q in range(len(table))]
+    later = CloudTable.make(counts, table.scenes, (step + n_steps for step in table.steps), particles.cu_rows.device)
+    return particles.with_clouds(later)
 
 
-def _put_runs(x: Tensor, runs: Sequence[tuple[int, int]], n_rows: int, other: float = 0.0) -> Tensor:
-    """[n_rows, ...], the rows of ``x`` one run after another; ``other`` elsewhere."""
-    pieces, end = [], 0
-    for part, (begin, until) in zip(x.split([until - begin for begin, until in runs]), runs, strict=True):
-        pieces += [x.new_full((begin - end, *x.shape[1:]), other), part]
-        end = until
-    return torch.cat([*pieces, x.new_full((n_rows - end, *x.shape[1:]), other)])
-
-
-def _packed(seen: Tensor, cu_rows: Tensor, n_rows: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _seen_first(seen: Tensor, cu_rows: Tensor, n_rows: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """``n_rows`` rows, those that are ``seen`` first: int64 [n_rows] which, where clouds begin among them (the last one
     ends with all), bool [n_rows] whether they are seen, and how many are seen in all. Waits for nothing."""
     until = F.pad(seen.cumsum(0), (1, 0))
     rows = torch.sort((~seen).to(torch.uint8), stable=True).indices[:n_rows]
     starts = until[cu_rows].clamp(max=n_rows)
     return rows, torch.cat([starts[:-1], starts.new_full((1,), n_rows)]), seen[rows], until[-1]
-
-
-def _as_it_began(history: Particles, bodies: bool) -> Particles:
-    """``history`` whose frozen rows look as they did when the simulation began; with ``bodies`` all rows."""
-    relit = ((history.activity == FROZEN) | bodies & (history.activity != ASLEEP))[:, None]
-    latents = torch.where(relit, history.initial_latents, history.dynamic_latents)
-    return dataclasses.replace(history, dynamic_latents=latents)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from gsim3d.dynamics.background import Background
-from gsim3d.dynamics.parts import Parts
+from gsim3d.dynamics.frozen_context import FrozenContext
+from gsim3d.dynamics.partition import Partition
 from gsim3d.dynamics.sleep import RestLog, Sleepers
 from gsim3d.state import Particles, append_step, concatenate, last_steps, single_steps
 
@@ -32,12 +32,12 @@ def rollout(
 
 
 def rollout_in_parts(
-    predict: Callable[[Particles, Background | None], Particles],
+    predict: Callable[[Particles, FrozenContext | None], Particles],
     history: Particles,
     n_steps: int,
     max_steps: int,
     *,
-    remember: Callable[[Particles], Background] | None = None,
+    remember: Callable[[Particles], FrozenContext] | None = None,
     sleepers: Sleepers | None = None,
     log: RestLog | None = None,
 ) -> list[Particles]:
@@ -57,7 +57,7 @@ def rollout_in_parts(
             asleep, begin = None, len(steps)
             if steps:  # all that the model sees was simulated when somebody falls asleep first
                 history, asleep = last_steps(concatenate(steps[-max_steps:]), max_steps), sleepers.asleep
-            parts = Parts.of(history, asymmetric=remember is not None, asleep=asleep)
+            parts = Partition.of(history, asymmetric=remember is not None, asleep=asleep)
             moving, background = parts.moving, None
             if parts.background is not None and not parts.nothing_moves:
                 background = remember(parts.background)

@@ -22,11 +22,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from gsim3d.dynamics.state import rotate_left
 from gsim3d.effects.selection import Selection, Vector, newest_mask
 from gsim3d.errors import InputError
 from gsim3d.io.files import read_yaml, shown, typed
-from gsim3d.math.rotations import quat_product, rotation_matrices
+from gsim3d.math.rotations import quat_product, rotate_left, rotation_matrices
 from gsim3d.math.spherical_harmonics import painted, rotate_harmonics
 from gsim3d.state import ATTRIBUTES, FROZEN, CloudTable, Particles, newest_clouds, with_attribute, with_same_attributes
 

@@ -6,8 +6,9 @@ import dataclasses
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from gsim3d.dynamics.config import BLOCK_KERNEL, STEM_KERNEL, DynamicsConfig
+from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.effects.spec import EffectsSpec, UnsupportedEffect
+from gsim3d.nn.point_transformer import BLOCK_KERNEL, STEM_KERNEL
 from gsim3d.presets import ModelConfig
 
 # Of a surface in a grid, a convolution of K^3 taps finds about K^2 neighbours; a coarser grid keeps 1 / stride^2 rows.
@@ -164,7 +165,7 @@ def background_cost(plan: Plan, model: ModelConfig, work: Workload) -> float:
 
 def _network(config: DynamicsConfig, particles: float, history: int, context: float = 0.0) -> float:
     """Multiply-adds of the dynamics network on ``particles``, which read features of ``context`` frozen ones."""
-    from gsim3d.dynamics.state import StateLayout
+    from gsim3d.dynamics.step import StateLayout
 
     layout, channels = StateLayout.of(config), config.encoder_channels
     merged = config.pyramid_spec((history - 1).bit_length()).merged_bits()

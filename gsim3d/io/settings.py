@@ -116,7 +116,7 @@ def _convert(hint: Any, value: Any, where: str, base: Any) -> Any:
                 problems.append(error)
         raise problems[0]
     if dataclasses.is_dataclass(hint):
-        return from_dict(hint, value, where, base)
+        return from_dict(_variant(hint, value, where), value, where, base)
     if origin is tuple:
         if not isinstance(value, (list, tuple)):
             raise InputError(f"{where}: must be a list; got {shown(value)}")
@@ -145,6 +145,18 @@ def _convert(hint: Any, value: Any, where: str, base: Any) -> Any:
             raise InputError(f"{where}: must be {plain[kind]}; got {shown(value)}")
         return float(value) if kind is float else value
     return value
+
+
+def _variant(cls: type, value: Any, where: str) -> type:
+    """``cls``, or of a class with variants the one whose ``type`` is given."""
+    variants = getattr(cls, "VARIANTS", None)
+    if variants is None or not isinstance(value, dict):
+        return cls
+    kind = value.get("type")
+    if kind not in variants:
+        hint = did_you_mean(kind, variants)
+        raise InputError(f"{_join(where, 'type')}: must be one of {', '.join(variants)}; got {shown(kind)}{hint}")
+    return variants[kind]
 
 
 def _join(where: str, name: str) -> str:

@@ -6,6 +6,8 @@ from torch.nn import functional as F
 
 MIN_QUAT_NORM = 1e-6  # a shorter quaternion has no direction worth a gradient
 
+SMALL_ANGLE_SQUARED = 1e-8  # radians^2; smaller rotations are their series: a square root has no gradient at 0
+
 
 def unit_quats(quats: Tensor) -> Tensor:
     """[..., 4] normalised; the identity, without a gradient, where shorter than 1e-6."""
@@ -54,3 +56,27 @@ def rotation_matrices(quats: Tensor) -> Tensor:
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
     ]  # fmt: skip
     return torch.stack(rows, 1).unflatten(1, (3, 3))
+
+
+def rotate_left(quats: Tensor, rotation_vectors: Tensor) -> Tensor:
+    """Unit quaternions of ``quats`` turned further about world axes: exp(v) q.
+
+    Of the two quaternions of a rotation the result is the one whose largest component is positive: the network reads
+    quaternions, and should see one rotation as one.
+
+    Args:
+        quats: [N, 4] (w, x, y, z), any length; shorter than 1e-6 counts as the identity and has no gradient.
+        rotation_vectors: [N, 3] radians, world axes.
+    """
+    angle_squared = rotation_vectors.square().sum(1, keepdim=True)
+    small = angle_squared < SMALL_ANGLE_SQUARED
+    angle = torch.where(small, 1.0, angle_squared).sqrt()
+    # sin(angle / 2) / angle and cos(angle / 2), by their series where the quotient would lose its gradient
+    ratio = torch.where(small, 0.5 - angle_squared / 48, torch.sin(angle / 2) / angle)
+    w = torch.where(small, 1 - angle_squared / 8, torch.cos(angle / 2))
+    v = ratio * rotation_vectors
+    quats = unit_quats(quats)
+    qw, qv = quats[:, :1], quats[:, 1:]
+    turned = torch.cat([w * qw - (v * qv).sum(1, keepdim=True), w * qv + qw * v + torch.linalg.cross(v, qv)], 1)
+    largest = turned.detach().gather(1, turned.detach().abs().argmax(1, keepdim=True))
+    return torch.where(largest < 0, -turned, turned)

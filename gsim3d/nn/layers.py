@@ -65,6 +65,14 @@ class RowLinear(nn.Linear):
         return some
 
 
+def rounded_linear(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """As :class:`RowLinear`, of weights that are made anew at each call."""
+    if not x.is_cuda or torch.compiler.is_compiling():
+        return row_linear(x, weight, bias)
+    x = x.to(product_dtype(x))
+    return _RowLinear.apply(x, weight, bias, *(t.detach().to(x.dtype) for t in (weight, bias)))
+
+
 class _RowLinear(torch.autograd.Function):
     """On a GPU torch would sum the gradients of biases slowly, and those of weights in 16 bits."""
 

@@ -8,6 +8,8 @@ Source: Point Transformer V3 (Wu et al. 2024), time merging of 3DGSim.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor, nn
@@ -15,8 +17,7 @@ from torch.nn import functional as F
 from torch.utils.checkpoint import checkpoint
 
 from gsim3d import ops
-from gsim3d.dynamics.background import Reader, Recorder
-from gsim3d.dynamics.config import BLOCK_KERNEL, STEM_KERNEL, DynamicsConfig
+from gsim3d.errors import check_ranges
 from gsim3d.nn.fused_block import run_block
 from gsim3d.nn.layers import (
     RowLayerNorm,
@@ -25,36 +26,173 @@ from gsim3d.nn.layers import (
     make_norm,
     product_dtype,
     round_at_once,
+    rounded_linear,
     rounded_weights,
+    row_linear,
     widened,
 )
-from gsim3d.ops.curve import PatchTable, Pyramid, Stage
+from gsim3d.ops.curve import PatchTable, Pyramid, PyramidSpec, Stage
 from gsim3d.ops.streams import Branches
 
-Beside = Recorder | Reader
+STEM_KERNEL, BLOCK_KERNEL = 5, 3  # edges of the convolutions, in cells
+MAX_HISTORY_BITS = 32  # that the geometry counts
 TIME_EMBEDDING_STD = 0.02
-TOLD_MULTIPLE = 8  # of the columns of a matrix product; with others the bits of a row depend on its place in the list
+COLUMN_MULTIPLE = 8  # of a matrix product; with others the bits of a row depend on its place in the list
+
+
+@dataclass(frozen=True, kw_only=True)
+class TransformerConfig:
+    """Geometry and layers of a :class:`PointTransformer` of S levels; every per-level tuple starts at the finest.
+
+    Attributes:
+        grid_size: metres, edge of a cell at level 0.
+        history_bits: a history has 1 to 2^history_bits steps.
+        strides, merge_windows: S - 1 powers of two: how much coarser the next level is, how many steps it merges.
+        patch_sizes: particles that attend to each other.
+        time_embedding: merged steps are told apart by a learned vector.
+        encoder_depths, encoder_channels, encoder_heads: S each.
+        decoder_depths, decoder_channels, decoder_heads: S - 1 each, levels 0 to S - 2.
+        mlp_ratio: hidden channels of a block's MLP over its channels.
+        norm: "layer", or "batch" as published: evaluation uses running statistics, training those of the call.
+        zero_init: the last layer starts at zero: an untrained model that predicts differences predicts none.
+        drop_path: share of particles that skip a branch of a block, growing from 0 at the first block. In training.
+        checkpointing: blocks are computed again in the backward pass instead of being kept.
+    """
+
+    grid_size: float = 0.004
+    history_bits: int = 2
+    strides: tuple[int, ...] = (4, 2, 2, 2)
+    merge_windows: tuple[int, ...] = (2, 2, 2, 8)
+    patch_sizes: tuple[int, ...] = (1024,) * 5
+    time_embedding: bool = True
+    encoder_depths: tuple[int, ...] = (2, 2, 2, 6, 2)
+    encoder_channels: tuple[int, ...] = (32, 64, 128, 256, 512)
+    encoder_heads: tuple[int, ...] = (2, 4, 8, 16, 32)
+    decoder_depths: tuple[int, ...] = (2, 2, 2, 2)
+    decoder_channels: tuple[int, ...] = (64, 64, 128, 256)
+    decoder_heads: tuple[int, ...] = (4, 4, 8, 16)
+    mlp_ratio: int = 4
+    norm: str = "batch"
+    zero_init: bool = False
+    drop_path: float = 0.3
+    checkpointing: bool = False
+
+    def __post_init__(self):
+        name, n = type(self).__name__, self.n_stages
+        sizes = {
+            "strides": n - 1, "merge_windows": n - 1, "patch_sizes": n,
+            "encoder_depths": n, "encoder_heads": n,
+            "decoder_depths": n - 1, "decoder_channels": n - 1, "decoder_heads": n - 1,
+        }  # fmt: skip
+        for key, size in sizes.items():
+            if len(getattr(self, key)) != size:
+                raise ValueError(f"{name}: {key} must have {size} entries, for {n} stages; got {getattr(self, key)}")
+        for part in ("encoder", "decoder"):
+            for channels, heads in zip(getattr(self, f"{part}_channels"), getattr(self, f"{part}_heads"), strict=True):
+                if channels % heads:
+                    raise ValueError(f"{name}: {part}_channels {channels} cannot be split into {heads} heads")
+        if self.norm not in ("layer", "batch"):
+            raise ValueError(f'{name}: norm must be "layer" or "batch"; got {self.norm!r}')
+        if not 0 <= self.history_bits <= MAX_HISTORY_BITS:
+            raise ValueError(f"{name}: history_bits must be from 0 to {MAX_HISTORY_BITS}; got {self.history_bits}")
+        check_ranges(self, grid_size=(1e-6, 1e6), drop_path=(0, 1), mlp_ratio=(1, 100))
+        counts = ("strides", "merge_windows", "patch_sizes", "encoder_heads", "decoder_heads")
+        check_ranges(self, **dict.fromkeys((*counts, "encoder_channels", "decoder_channels"), (1, 10**5)))
+        check_ranges(self, **dict.fromkeys(("encoder_depths", "decoder_depths"), (0, 100)))
+
+    @property
+    def n_stages(self) -> int:
+        return len(self.encoder_channels)
+
+    @property
+    def out_channels(self) -> int:
+        """Channels of a particle behind the decoder."""
+        return (*self.decoder_channels, self.encoder_channels[-1])[0]
+
+    @property
+    def origin_of_scene(self) -> bool:
+        """Whether cells are counted from the origin of a scene, so that scenes do not see each other."""
+        return True
+
+    @property
+    def slots_from_newest(self) -> bool:
+        """Whether steps are counted back from the newest, so that it has one place in histories of any length."""
+        return True
+
+    def pyramid_spec(self, history_bits: int) -> PyramidSpec:
+        """What the geometry op needs to know, for a history of up to 2^history_bits steps."""
+        return PyramidSpec(
+            grid_size=self.grid_size,
+            slot_bits=history_bits,
+            strides=tuple(self.strides),
+            merge_windows=tuple(self.merge_windows),
+            patch_sizes=tuple(self.patch_sizes),
+            kernel_sizes=((STEM_KERNEL, BLOCK_KERNEL),) + ((BLOCK_KERNEL,),) * (self.n_stages - 1),
+            release=not self.origin_of_scene,
+        )
+
+
+class FrozenContext(Protocol):
+    """What particles of a level read besides each other, or what records that: see :mod:`gsim3d.dynamics`.
+
+    Attributes:
+        records: whether it keeps what this call computes, instead of adding to it.
+    """
+
+    records: bool
+
+    def convolved(self, conv: nn.Module, x: Tensor, out: Tensor) -> Tensor:
+        """``out``, which ``conv`` made of ``x``, with what the context adds."""
+
+    def attended(self, attention: nn.Module, q: Tensor, k: Tensor, v: Tensor, patches: PatchTable, row: int) -> Tensor:
+        """The attention of ``q`` to ``k``, ``v`` and the context."""
+
+
+class Extension(Protocol):
+    """Further inputs and outputs of a network with weights of their own, joined to its products in order.
+
+    Attributes:
+        conv_proj: convolution of further inputs into the stem; None: there are none.
+        in_proj: product of inputs that are not convolved.
+        gain_head: product of the last hidden channels, for further outputs.
+    """
+
+    conv_proj: SparseConv | None
+    in_proj: RowLinear | None
+    gain_head: RowLinear | None
 
 
 class SparseConv(nn.Module):
-    """Submanifold convolution; weight [C_out, K, K, K, C_in]. duplicates: as of :func:`gsim3d.ops.sparse_conv`."""
+    """Submanifold convolution; weight [C_out, K, K, K, C_in].
+
+    Attributes:
+        duplicates: as of :func:`gsim3d.ops.sparse_conv`.
+        extensions: convolutions of further inputs, which come behind its own and are added in one product.
+    """
 
     duplicates = "mean"
 
     def __init__(self, in_channels: int, out_channels: int, kernel_size: int, *, bias: bool):
         super().__init__()
-        self.kernel_size = kernel_size
+        self.kernel_size, self.extensions = kernel_size, ()
         bound = (in_channels * kernel_size**3) ** -0.5
         shape = (out_channels, kernel_size, kernel_size, kernel_size, in_channels)
         self.weight = nn.Parameter(torch.empty(shape).uniform_(-bound, bound))
         self.bias = nn.Parameter(torch.empty(out_channels).uniform_(-bound, bound)) if bias else None
 
-    def forward(self, x: Tensor, stage: Stage, beside: Beside | None = None) -> Tensor:
-        kernel_map, weight, bias = stage.kernel_maps[self.kernel_size], self.weight, self.bias
+    def full_weight(self) -> Tensor:
+        """The weight with those of all extensions."""
+        return torch.cat([conv.weight for conv in (self, *self.extensions)], -1) if self.extensions else self.weight
+
+    def forward(self, x: Tensor, stage: Stage, context: FrozenContext | None = None) -> Tensor:
+        kernel_map, weight, bias = stage.kernel_maps[self.kernel_size], self.full_weight(), self.bias
         if x.is_cuda and not torch.is_grad_enabled() and not torch.compiler.is_compiling():
-            weight, bias = rounded_weights(self, product_dtype(x))
+            if self.extensions:
+                weight = weight.to(product_dtype(x))
+            else:
+                weight, bias = rounded_weights(self, product_dtype(x))
         out = ops.sparse_conv(x, weight, bias, stage.voxels, kernel_map, duplicates=self.duplicates, check=False)
-        return out if beside is None else beside.convolved(self, x, out)
+        return out if context is None else context.convolved(self, x, out)
 
 
 class PositionEncoding(nn.Module):
@@ -66,8 +204,8 @@ class PositionEncoding(nn.Module):
         self.linear = RowLinear(channels, channels)
         self.norm = RowLayerNorm(channels)
 
-    def forward(self, x: Tensor, stage: Stage, residual: Tensor, beside: Beside | None = None) -> Tensor:
-        return self.norm(self.linear(self.conv(x, stage, beside)), residual)
+    def forward(self, x: Tensor, stage: Stage, residual: Tensor, context: FrozenContext | None = None) -> Tensor:
+        return self.norm(self.linear(self.conv(x, stage, context)), residual)
 
 
 class Attention(nn.Module):
@@ -79,13 +217,13 @@ class Attention(nn.Module):
         self.qkv = RowLinear(channels, 3 * channels)
         self.proj = RowLinear(channels, channels)
 
-    def forward(self, x: Tensor, patches: PatchTable, row: int = 0, beside: Beside | None = None) -> Tensor:
+    def forward(self, x: Tensor, patches: PatchTable, row: int = 0, context: FrozenContext | None = None) -> Tensor:
         """x [N, C] in the patches of serialization ``row``."""
         q, k, v = self.qkv(x).unflatten(1, (3, self.heads, -1)).unbind(1)
-        if beside is None:
+        if context is None:
             out = ops.patch_attention(q, k, v, patches, check=False)
         else:
-            out = beside.attended(self, q, k, v, patches, row)
+            out = context.attended(self, q, k, v, patches, row)
         return self.proj(out.flatten(1))
 
 
@@ -105,7 +243,7 @@ class Block(nn.Module):
     ``fused``: computed by :mod:`gsim3d.nn.fused_block` instead of the modules; None: on a GPU.
     """
 
-    def __init__(self, channels: int, heads: int, drop_path: float, config: DynamicsConfig):
+    def __init__(self, channels: int, heads: int, drop_path: float, config: TransformerConfig):
         super().__init__()
         self.drop_path, self.checkpointing, self.fused = drop_path, config.checkpointing, None
         self.position = PositionEncoding(channels)
@@ -122,20 +260,20 @@ class Block(nn.Module):
         *,
         conv_input: Tensor | None = None,
         generator: torch.Generator | None = None,
-        beside: Beside | None = None,
+        context: FrozenContext | None = None,
     ) -> Tensor:
         """x [N, C] with attention along serialization ``row``. ``conv_input``: read by the convolution, default x."""
         conv_input = x if conv_input is None else conv_input
-        if self.is_fused(x, beside):
-            return self.advance(x, conv_input, stage, row, generator, beside)[0]
+        if self.is_fused(x, context):
+            return self.advance(x, conv_input, stage, row, generator, context)[0]
         keep = self._draw_keep(x, generator)
         if self._recomputes():
-            arguments = (x, conv_input, stage, row, *keep, beside)
+            arguments = (x, conv_input, stage, row, *keep, context)
             return checkpoint(self._compute, *arguments, use_reentrant=False, preserve_rng_state=False)
-        return self._compute(x, conv_input, stage, row, *keep, beside)
+        return self._compute(x, conv_input, stage, row, *keep, context)
 
-    def is_fused(self, x: Tensor, beside: Beside | None = None) -> bool:
-        if isinstance(beside, Recorder) or (beside is not None and torch.is_grad_enabled()):
+    def is_fused(self, x: Tensor, context: FrozenContext | None = None) -> bool:
+        if (context is not None and context.records) or (context is not None and torch.is_grad_enabled()):
             return False
         if torch.compiler.is_compiling() or type(self.attention) is not Attention:  # a subclass computes otherwise
             return False
@@ -148,19 +286,19 @@ class Block(nn.Module):
         stage: Stage,
         row: int,
         generator: torch.Generator | None,
-        beside: Reader | None = None,
+        context: FrozenContext | None = None,
     ) -> tuple[Tensor, Tensor]:
         """What :meth:`forward` returns where the block is fused, and the same in the dtype that convolutions read."""
         keep = self._draw_keep(x, generator)
         conv_input = conv_input.to(product_dtype(x))
-        return run_block(self, x, conv_input, stage, row, keep, self._recomputes(), beside)
+        return run_block(self, x, conv_input, stage, row, keep, self._recomputes(), context)
 
     def _recomputes(self) -> bool:
         return self.checkpointing and self.training and torch.is_grad_enabled()
 
-    def _compute(self, x, conv_input, stage, row, keep_attention, keep_mlp, beside):
-        x = self.position(conv_input, stage, x, beside)
-        x = x + scaled(self.attention(self.norm1(x), stage.patches[row], row, beside), keep_attention)
+    def _compute(self, x, conv_input, stage, row, keep_attention, keep_mlp, context):
+        x = self.position(conv_input, stage, x, context)
+        x = x + scaled(self.attention(self.norm1(x), stage.patches[row], row, context), keep_attention)
         return x + scaled(self.mlp(self.norm2(x)), keep_mlp)
 
     def _draw_keep(self, x: Tensor, generator: torch.Generator | None) -> list[Tensor | None]:
@@ -184,7 +322,7 @@ def run_blocks(
     conv_input: Tensor,
     stage: Stage,
     generator: torch.Generator | None,
-    beside: Beside | None = None,
+    context: FrozenContext | None = None,
     *,
     for_products: bool = False,
 ) -> Tensor:
@@ -195,32 +333,33 @@ def run_blocks(
     x = widened(x)
     for i, block in enumerate(blocks):
         row = i % len(stage.patches)
-        if block.is_fused(x, beside):
-            x, conv_input = block.advance(x, conv_input, stage, row, generator, beside)
+        if block.is_fused(x, context):
+            x, conv_input = block.advance(x, conv_input, stage, row, generator, context)
         else:
-            x = conv_input = block(x, stage, row, conv_input=conv_input, generator=generator, beside=beside)
+            x = conv_input = block(x, stage, row, conv_input=conv_input, generator=generator, context=context)
     return conv_input if for_products and len(blocks) > 0 and not torch.is_grad_enabled() else x
 
 
 class Stem(nn.Module):
-    """Features of the particles -> channels of stage 0. What rows are told alone, the last ones, is not convolved."""
+    """Features of the particles -> channels of stage 0: own ones and those of extensions that are convolved, then those
+    of extensions that are not."""
 
-    def __init__(self, in_channels: int, told_channels: int, config: DynamicsConfig):
+    def __init__(self, in_channels: int, config: TransformerConfig, extensions: Sequence[Extension] = ()):
         super().__init__()
         channels = config.encoder_channels[0]
-        self.widths = in_channels, told_channels
         self.conv = SparseConv(in_channels, channels, STEM_KERNEL, bias=False)
-        rounded = -(-told_channels // TOLD_MULTIPLE) * TOLD_MULTIPLE
-        self.told = RowLinear(rounded, channels, bias=False) if told_channels else None
-        if told_channels:  # what begins with these weights may be told more
-            nn.init.zeros_(self.told.weight[:, told_channels:])
+        self.conv.extensions = tuple(of.conv_proj for of in extensions if of.conv_proj is not None)
+        self._in_projs = tuple(of.in_proj for of in extensions if of.in_proj is not None)
         self.norm = make_norm(config.norm, channels)
 
-    def forward(self, x: Tensor, stage: Stage, beside: Beside | None = None) -> Tensor:
-        x, told = x.split(self.widths, 1)
-        x = self.conv(x.contiguous(), stage, beside)
-        if self.told is not None:
-            x = x + self.told(F.pad(told, (0, self.told.in_features - told.shape[1])))
+    def forward(self, x: Tensor, stage: Stage, context: FrozenContext | None = None) -> Tensor:
+        n = sum(linear.in_features for linear in self._in_projs)
+        x, others = x.split([x.shape[1] - n, n], 1)
+        x = self.conv(x.contiguous(), stage, context)
+        if n:
+            padding = (0, -n % COLUMN_MULTIPLE)
+            weight = torch.cat([linear.weight for linear in self._in_projs], 1)
+            x = x + row_linear(F.pad(others, padding), F.pad(weight, padding), None)
         return self.norm.activated(x, stage.n_data)
 
 
@@ -261,7 +400,7 @@ class Merge(nn.Module):
 
 
 class EncoderStage(nn.Module):
-    def __init__(self, index: int, drop_paths: list[float], config: DynamicsConfig):
+    def __init__(self, index: int, drop_paths: list[float], config: TransformerConfig):
         super().__init__()
         channels, self.is_last = config.encoder_channels, config.n_stages == 1
         self.pool = Pool(channels[index - 1], channels[index], config.norm) if index > 0 else None
@@ -274,13 +413,13 @@ class EncoderStage(nn.Module):
         )
 
     def forward(
-        self, x: Tensor, stage: Stage, generator: torch.Generator | None, beside: Beside | None = None
+        self, x: Tensor, stage: Stage, generator: torch.Generator | None, context: FrozenContext | None = None
     ) -> Tensor:
         if self.pool is not None:
             x = self.pool(x, stage)
         if self.merge is not None and self.merge.marks(stage):
             x = self.merge(x, stage)
-        return run_blocks(self.blocks, x, x, stage, generator, beside, for_products=not self.is_last)
+        return run_blocks(self.blocks, x, x, stage, generator, context, for_products=not self.is_last)
 
 
 class Unpool(nn.Module):
@@ -303,7 +442,7 @@ class Unpool(nn.Module):
 
 
 class DecoderStage(nn.Module):
-    def __init__(self, index: int, drop_paths: list[float], config: DynamicsConfig):
+    def __init__(self, index: int, drop_paths: list[float], config: TransformerConfig):
         super().__init__()
         channels = config.decoder_channels
         below = (*channels, config.encoder_channels[-1])[index + 1]
@@ -320,11 +459,11 @@ class DecoderStage(nn.Module):
         stage: Stage,
         coarse: Stage,
         generator: torch.Generator | None,
-        beside: Beside | None = None,
+        context: FrozenContext | None = None,
     ) -> Tensor:
         x = self.unpool(x, skip, coarse)
         conv_input = self.conv_input(x, skip)
-        return run_blocks(self.blocks, x, conv_input, stage, generator, beside, for_products=not self.is_last)
+        return run_blocks(self.blocks, x, conv_input, stage, generator, context, for_products=not self.is_last)
 
     def conv_input(self, x: Tensor, skip: Tensor) -> Tensor:
         """What the first convolution reads."""
@@ -332,8 +471,11 @@ class DecoderStage(nn.Module):
 
 
 class Head(nn.Module):
-    def __init__(self, channels: int, out_channels: int, zero_init: bool):
+    """Hidden channels -> outputs, those of extensions behind its own."""
+
+    def __init__(self, channels: int, out_channels: int, zero_init: bool, extensions: Sequence[Extension] = ()):
         super().__init__()
+        self._products = tuple(of.gain_head for of in extensions if of.gain_head is not None)
         self.norm = RowLayerNorm(channels)
         self.fc1 = RowLinear(channels, channels)
         self.fc2 = RowLinear(channels, out_channels)
@@ -344,28 +486,35 @@ class Head(nn.Module):
     def forward(self, x: Tensor, outputs: Sequence[tuple[int, int]] | None = None) -> Tensor:
         """``outputs``: channels to compute, as :meth:`RowLinear.some`; None: all."""
         x = self.fc1(F.gelu(self.norm(x)))
+        if self._products:
+            parts = self.fc2, *self._products
+            weight, bias = (torch.cat([getattr(part, name) for part in parts]) for name in ("weight", "bias"))
+            if outputs is not None:
+                weight, bias = (torch.cat([t[a:b] for a, b in outputs]) for t in (weight, bias))
+            return rounded_linear(x, weight, bias)
         return self.fc2(x) if outputs is None else self.fc2.some(x, outputs)
 
 
 class PointTransformer(nn.Module):
-    """Features [N, in_channels + told_channels] of all clouds -> features [N, decoder_channels[0]] of the same rows,
-    and a head.
+    """Features of all clouds -> features [N, config.out_channels] of the same particles, and a head.
 
     Args of forward:
-        x: features of the rows of stage 0.
+        x: [N, in_channels and those of extensions, convolved ones first], of the particles of stage 0.
         pyramid: their geometry.
         generator: of drop path, in training; None: no drop path.
-        besides: of each stage what else its rows read, or who listens; none: nothing and nobody.
+        contexts: of each stage what its particles read besides each other; none: nothing.
     """
 
-    def __init__(self, in_channels: int, told_channels: int, out_channels: int, config: DynamicsConfig):
+    def __init__(
+        self, in_channels: int, out_channels: int, config: TransformerConfig, extensions: Sequence[Extension] = ()
+    ):
         super().__init__()
-        self.stem = Stem(in_channels, told_channels, config)
+        self.stem = Stem(in_channels, config, extensions)
         rates = linear_rates(config.drop_path, config.encoder_depths)
         self.encoder = nn.ModuleList(EncoderStage(s, rates[s], config) for s in range(config.n_stages))
         rates = linear_rates(config.drop_path, config.decoder_depths)
         self.decoder = nn.ModuleList(DecoderStage(s, rates[s][::-1], config) for s in range(config.n_stages - 1))
-        self.head = Head((*config.decoder_channels, config.encoder_channels[-1])[0], out_channels, config.zero_init)
+        self.head = Head(config.out_channels, out_channels, config.zero_init, extensions)
         parts = (self.encoder, self.decoder)
         self._products = [m for part in parts for m in part.modules() if isinstance(m, (RowLinear, SparseConv))]
 
@@ -375,30 +524,30 @@ class PointTransformer(nn.Module):
         pyramid: Pyramid,
         *,
         generator: torch.Generator | None = None,
-        besides: Sequence[Beside] = (),
+        contexts: Sequence[FrozenContext] = (),
     ) -> Tensor:
-        besides = besides or [None] * len(pyramid.stages)
+        contexts = contexts or [None] * len(pyramid.stages)
         if not x.is_cuda or torch.compiler.is_compiling():
-            x = self.stem(x, pyramid.stages[0], besides[0])
-            return self._behind_stem(x, pyramid, generator, besides)
+            x = self.stem(x, pyramid.stages[0], contexts[0])
+            return self._behind_stem(x, pyramid, generator, contexts)
         with Branches(x) as branches:
             rounded = branches.run(round_at_once, self._products, product_dtype(x))
-            x = self.stem(x, pyramid.stages[0], besides[0])
+            x = self.stem(x, pyramid.stages[0], contexts[0])
         with at_hand(rounded):
-            return self._behind_stem(x, pyramid, generator, besides)
+            return self._behind_stem(x, pyramid, generator, contexts)
 
     def _behind_stem(
-        self, x: Tensor, pyramid: Pyramid, generator: torch.Generator | None, besides: Sequence[Beside | None]
+        self, x: Tensor, pyramid: Pyramid, generator: torch.Generator | None, contexts: Sequence[FrozenContext | None]
     ) -> Tensor:
         stages, skips = pyramid.stages, []
         with Branches(x) as branches:
-            for s, (encoder, stage, beside) in enumerate(zip(self.encoder, stages, besides, strict=True)):
-                x = encoder(x, stage, generator, beside)
+            for s, (encoder, stage, context) in enumerate(zip(self.encoder, stages, contexts, strict=True)):
+                x = encoder(x, stage, generator, context)
                 if s < len(self.decoder):  # made beside the deeper stages
                     lift = self.decoder[s].unpool.lift
                     skips.append(lift(x, stage) if torch.is_grad_enabled() else branches.run(lift, x, stage))
         for s in reversed(range(len(self.decoder))):
-            x = self.decoder[s](x, skips[s], stages[s], stages[s + 1], generator, besides[s])
+            x = self.decoder[s](x, skips[s], stages[s], stages[s + 1], generator, contexts[s])
         return x
 
 

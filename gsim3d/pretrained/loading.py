@@ -16,7 +16,7 @@ from torch.nn.modules.module import (
 from torch.overrides import TorchFunctionMode
 
 from gsim3d.cameras import InputSpec
-from gsim3d.compat.checkpoints import current_model
+from gsim3d.compat.checkpoints import current_model, current_weights
 from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError
 from gsim3d.io.files import shown
@@ -105,6 +105,7 @@ def with_weights(
         InputError: the weights do not fit the model.
     """
     try:
+        weights = current_weights(weights, config.dynamics)
         check_sizes(make, config, effects, weights)
         simulator = build(make, config)
         own = first_weights(simulator, effects, weights)

@@ -19,9 +19,8 @@ from torch import Tensor
 
 from gsim3d.cameras import Cameras, Frames
 from gsim3d.dynamics import last_steps
-from gsim3d.dynamics.state import rotate_left
 from gsim3d.effects.plan import Plan
-from gsim3d.math.rotations import rotation_matrices
+from gsim3d.math.rotations import rotate_left, rotation_matrices
 from gsim3d.math.spherical_harmonics import rotate_harmonics
 from gsim3d.nn.gaussian_head import render
 from gsim3d.simulator import Simulator

@@ -28,7 +28,7 @@ from gsim3d.compat.released_model import (
     render_released,
     simulator_class,
 )
-from gsim3d.dynamics.state import StateLayout
+from gsim3d.dynamics.step import StateLayout
 from gsim3d.effects.spec import EffectsSpec, OutputEffects, UnsupportedEffect
 from gsim3d.io.settings import from_dict, to_dict
 from gsim3d.math.rotations import rotation_matrices, unit_quats
@@ -38,10 +38,11 @@ from gsim3d.nn.multiview_encoder.depth import Views
 from gsim3d.nn.multiview_encoder.heads import PixelRays
 from gsim3d.nn.multiview_encoder.transformer import MASKED, Windows
 from gsim3d.ops import build_pyramid
+from gsim3d.priors import InertiaConfig
 from gsim3d.simulator import Simulator
 from gsim3d.state import Gaussians
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
-from tests.dynamics.scenes import EXPLICIT, TINY, batch, make_dynamics, make_history
+from tests.dynamics.scenes import EXPLICIT, TINY, advance, batch, make_dynamics, make_history
 from tests.nn.multiview_encoder.scenes import make_encoder, make_frames
 
 ROOT = Path(__file__).parents[2]
@@ -69,7 +70,7 @@ def test_configuration_says_release_with_one_key():
     assert simulator_class(presets.tiny()) is Simulator
 
 
-@pytest.mark.parametrize("change", [{"background": "relightable"}, {"motion_length": 0.3}, {"contact_length": 0.1}])
+@pytest.mark.parametrize("change", [{"background": "relightable"}, {"priors": (InertiaConfig(),)}])
 def test_published_dynamics_have_nothing_beside_the_network(change):
     with pytest.raises(ValueError, match="ReleasedDynamicsConfig"):
         ReleasedDynamicsConfig(**change)
@@ -251,7 +252,7 @@ def test_slots_from_first(released):
 def advanced(particles, value, released):
     """An explicit state after a step in which every channel predicts ``value``."""
     layout = StateLayout.of(config_of(released, EXPLICIT))
-    (after,) = layout.advance(particles, torch.full((particles.n_rows, layout.out_channels), value))
+    (after,) = advance(layout, particles, torch.full((particles.n_rows, layout.out_channels), value))
     return after
 
 

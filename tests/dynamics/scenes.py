@@ -5,6 +5,7 @@ import dataclasses
 import torch
 
 from gsim3d.dynamics import Dynamics, DynamicsConfig
+from gsim3d.priors import DirectionalLightConfig, InertiaConfig, PositionWavesConfig, ProximityConfig
 from gsim3d.state import FROZEN, Particles
 
 TINY = DynamicsConfig(
@@ -29,8 +30,12 @@ TINY = DynamicsConfig(
     drop_path=0.0,
     shuffle_orders=False,
 )
-SEEING = {"motion_length": 0.2, "velocity": True, "position_waves": 2, "contact_length": 0.1}
-SEEING["lights"] = ((0.1, 0.2, 1.0),)
+SEEING = (
+    PositionWavesConfig(count=2),
+    ProximityConfig(range=0.1),
+    InertiaConfig(radius=0.2),
+    DirectionalLightConfig(directions=((0.1, 0.2, 1.0),), shading="occlusion", strength=0.2, unit=0.1, beam=2.0),
+)
 EXPLICIT = dataclasses.replace(TINY, explicit=True, sh_degree=1, scale_min=0.001, scale_max=0.1)
 
 
@@ -92,3 +97,9 @@ def permute_rows(history, seed=0):
 def float_fields(particles):
     names = ("means", "opacities", "dynamic_latents", "static_latents", "quats", "scales", "sh")
     return {name: getattr(particles, name) for name in names if getattr(particles, name) is not None}
+
+
+def advance(layout, particles, prediction, awake=None):
+    """The steps that a ``prediction`` [N, channels] of a network without priors makes of ``particles``."""
+    outputs, _ = layout.split(prediction, layout.changes())
+    return layout.advance(particles, outputs, layout.displacements(particles, outputs), awake)

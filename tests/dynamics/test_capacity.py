@@ -10,7 +10,7 @@ from gsim3d.state import ASLEEP
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import EXPLICIT, SEEING, TINY, batch, float_fields, make_dynamics, make_history
 
-MOVING = dataclasses.replace(TINY, **SEEING)
+MOVING = dataclasses.replace(TINY, priors=SEEING)
 RELIT = dataclasses.replace(MOVING, background="relightable")
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -10,7 +10,7 @@ from gsim3d.state import FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, with_threads
 from tests.dynamics.scenes import EXPLICIT, SEEING, TINY, batch, float_fields, make_dynamics, make_history, permute_rows
 
-MOVING = dataclasses.replace(TINY, **SEEING)
+MOVING = dataclasses.replace(TINY, priors=SEEING)
 
 
 def assert_same_particles(actual, expected, what=""):

@@ -10,7 +10,7 @@ from gsim3d.state import DYNAMIC, FROZEN
 from tests.asserts import assert_same_bits
 from tests.dynamics.scenes import EXPLICIT, SEEING, TINY, batch, float_fields, make_dynamics, make_history
 
-RELIT = dataclasses.replace(TINY, background="relightable", **SEEING)
+RELIT = dataclasses.replace(TINY, background="relightable", priors=SEEING)
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
@@ -79,7 +79,7 @@ def test_a_background_in_front_of_which_nothing_changes_does_not_change():
             velocity=torch.zeros_like(before.means),
             dynamic_latents=torch.where(bodies[:, None], before.dynamic_latents, step.dynamic_latents),
         )
-        return dynamics.in_light(step)
+        return dynamics.initialize(step)
 
     first, *others = rollout(predict, history, 4, 4)
     assert not torch.equal(first.dynamic_latents[frozen], history.dynamic_latents[:30][frozen])

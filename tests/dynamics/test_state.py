@@ -6,11 +6,12 @@ import pytest
 import torch
 
 from gsim3d.compat.released_model import ReleasedDynamicsConfig
-from gsim3d.dynamics.state import StateLayout, bounded, position_features, rotate_left
-from gsim3d.math.rotations import rotation_matrices
+from gsim3d.dynamics.step import StateLayout, position_features
+from gsim3d.math.rotations import rotate_left, rotation_matrices
+from gsim3d.priors.base import bounded
 from gsim3d.state import FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
-from tests.dynamics.scenes import EXPLICIT, TINY, float_fields, make_history
+from tests.dynamics.scenes import EXPLICIT, TINY, advance, float_fields, make_history
 
 LATENT = StateLayout.of(dataclasses.replace(TINY, position_features=False))
 
@@ -47,7 +48,7 @@ def test_increments():
     particles = make_history((20,), config=EXPLICIT)
     layout = StateLayout.of(EXPLICIT)
     prediction = 50 * torch.randn(20, layout.out_channels, generator=torch.Generator().manual_seed(0))
-    (after,) = layout.advance(particles, prediction)
+    (after,) = advance(layout, particles, prediction)
     moves = particles.activity != FROZEN
     assert ((after.means - particles.means).abs() <= EXPLICIT.max_step * 1.001).all()
     assert ((after.dynamic_latents - particles.dynamic_latents).abs() <= EXPLICIT.max_latent_step * 1.001).all()
@@ -73,8 +74,8 @@ def test_the_first_step_of_a_call_is_the_step_of_a_call_of_one(predicts):
     particles = make_history((20,), config=config)
     one, three = StateLayout.of(config), StateLayout.of(dataclasses.replace(config, steps_per_call=3))
     prediction = random_prediction(three, 20)
-    (alone,) = one.advance(particles, prediction[:, : one.out_channels])
-    steps = three.advance(particles, prediction)
+    (alone,) = advance(one, particles, prediction[:, : one.out_channels])
+    steps = advance(three, particles, prediction)
     assert len(steps) == 3
     for name, value in float_fields(alone).items():
         assert_same_bits(getattr(steps[0], name), value, name)
@@ -91,9 +92,9 @@ def test_differences_from_the_step_before_add_up():
     particles = make_history((20,), config=config, frozen_share=0.0)
     layout, single = StateLayout.of(config), StateLayout.of(newest_only)
     prediction = 0.1 * random_prediction(layout, 20)  # far from the limits of scales and opacities
-    _, second = layout.advance(particles, prediction)
-    (first,) = single.advance(particles, prediction[:, : single.out_channels])
-    (again,) = single.advance(first, prediction[:, single.out_channels :])
+    _, second = advance(layout, particles, prediction)
+    (first,) = advance(single, particles, prediction[:, : single.out_channels])
+    (again,) = advance(single, first, prediction[:, single.out_channels :])
     for name, value in float_fields(again).items():
         assert_close_relative_to_max(getattr(second, name), value, 1e-6, name)
 
@@ -104,7 +105,7 @@ def test_absolute_predictions_are_the_state():
     assert dict(layout.outputs)["quats"] == 4
     particles = make_history((20,), config=config, frozen_share=0.0)
     prediction = random_prediction(layout, 20, 3.0)
-    (after,) = layout.advance(particles, prediction)
+    (after,) = advance(layout, particles, prediction)
     parts = dict(zip(dict(layout.outputs), prediction.split([n for _, n in layout.outputs], 1), strict=True))
     assert_close_relative_to_max(after.means, parts["means"], 1e-6)
     assert_close_relative_to_max(after.opacities, parts["opacities"][:, 0].sigmoid(), 1e-6)
@@ -119,7 +120,7 @@ def test_rows_asleep_keep_every_bit(predicts):
     layout = StateLayout.of(config)
     particles = make_history((20,), config=config)
     awake = torch.arange(20) % 3 > 0
-    for step in layout.advance(particles, random_prediction(layout, 20), awake):
+    for step in advance(layout, particles, random_prediction(layout, 20), awake):
         for name, value in float_fields(particles).items():
             assert_same_bits(getattr(step, name)[~awake], value[~awake], name)
         assert not torch.equal(step.dynamic_latents[awake], particles.dynamic_latents[awake])

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from gsim3d.cuda_graphs import CapturedRollout
-from gsim3d.dynamics import DynamicsConfig, Parts, RestLog, last_steps, rollout, rollout_in_parts
-from gsim3d.dynamics.background import Background
+from gsim3d.dynamics import DynamicsConfig, Partition, RestLog, last_steps, rollout, rollout_in_parts
+from gsim3d.dynamics.frozen_context import FrozenContext
 from gsim3d.nn.point_transformer import SparseConv
 from gsim3d.ops import PatchTable, PyramidCapacity, curve_encode, joint_attention
 from gsim3d.ops.curve import CURVES
@@ -30,9 +30,9 @@ def read_and_reader(dtype=torch.float64):
     """Two scenes in parts: their geometry, and a background and a reader of stage 0 with nothing kept yet."""
     dynamics = make_dynamics(ASYMMETRIC, dtype=dtype)
     history = batch([make_history((150, 140), seed=i, frozen_share=0.6, dtype=dtype) for i in range(2)])
-    parts = Parts.of(history, asymmetric=True)
+    parts = Partition.of(history, asymmetric=True)
     rest, moving = dynamics.geometry(parts.background), dynamics.geometry(parts.moving)
-    background, recorders = Background.begin(rest, parts.background, ASYMMETRIC.pyramid_spec(0))
+    background, recorders = FrozenContext.begin(rest, parts.background, ASYMMETRIC.pyramid_spec(0))
     return parts, rest, moving, background, recorders[0]
 
 
@@ -224,7 +224,7 @@ def test_sleeping_particles_are_in_neither_part():
 
 @pytest.mark.parametrize("room", [1.0, 1.5])
 def test_capacity_changes_no_bit(room):
-    dynamics, parts = make_dynamics(ASYMMETRIC), Parts.of(make_scenes(), asymmetric=True)
+    dynamics, parts = make_dynamics(ASYMMETRIC), Partition.of(make_scenes(), asymmetric=True)
     background, exact = dynamics.remember(parts.background), dynamics.geometry(parts.moving)
     capacity = PyramidCapacity.of(exact, parts.moving.n_rows, room)
     given = dynamics.geometry(parts.moving, capacity=capacity)
@@ -342,7 +342,7 @@ def test_background_rollout_gradients(checkpointing):
 
 def test_shuffled_curves_match_background():
     config = dataclasses.replace(ASYMMETRIC, shuffle_orders=True, drop_path=0.2)
-    dynamics, parts = make_dynamics(config).train(), Parts.of(make_scenes(), asymmetric=True)
+    dynamics, parts = make_dynamics(config).train(), Partition.of(make_scenes(), asymmetric=True)
     draws = [torch.Generator().manual_seed(3) for _ in range(2)]
     backgrounds = [dynamics.remember(parts.background, generator=g) for g in draws]
     assert backgrounds[0].curves == backgrounds[1].curves != ((0, 1, 2, 3),) * 3

@@ -22,9 +22,11 @@ from gsim3d.effects.edits import (
 )
 from gsim3d.effects.spec import DynamicsEffects, EffectsSpec, Sleep, StructureEffects
 from gsim3d.errors import InputError
+from gsim3d.priors import InertiaConfig, ShapeMatchingConfig
 from gsim3d.state import DYNAMIC, FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.effects.models import MODELS
+from tests.priors.scenes import OCCLUSION
 from tests.test_simulator import CONFIG, awake, make_frames, make_simulator, target_cameras
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -288,7 +290,7 @@ def test_load_edits_refuses_malformed_files(tmp_path, text, message):
 @pytest.mark.parametrize("model", CONFIGS)
 def test_edit_of_model_with_all_priors(model):
     """Its particles have every field that there is."""
-    more = {"motion_length": 0.5, "velocity": True, "deformation": True, "lights": ((0.0, 0.0, 1.0),)}
+    more = {"priors": (InertiaConfig(radius=0.5), ShapeMatchingConfig(radius=0.5), OCCLUSION)}
     more |= {"background": "relightable"} if model == "latent" else {}
     config = CONFIGS[model]
     config = dataclasses.replace(config, dynamics=dataclasses.replace(config.dynamics, **more))
@@ -305,8 +307,7 @@ def test_edit_of_model_with_all_priors(model):
 @pytest.mark.parametrize("step", [0, 1])
 def test_removed_particles_occlude_no_light(step):
     """The conditioning features of the network, from the step of the edit on."""
-    more = {"lights": ((0.1, 0.2, 1.0),)}
-    config = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, **more))
+    config = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, priors=(OCCLUSION,)))
     simulator, state, _ = encoded(config)
     told = []
     simulator.dynamics.register_forward_pre_hook(

@@ -5,8 +5,8 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.dynamics import Parts
-from gsim3d.dynamics.background import Reader
+from gsim3d.dynamics import Partition
+from gsim3d.dynamics.frozen_context import Reader
 from gsim3d.effects.plan import Workload, background_cost, predicted_cost
 from gsim3d.effects.spec import DynamicsEffects, EffectsSpec
 from gsim3d.nn.point_transformer import Attention
@@ -46,7 +46,7 @@ def test_sleep_cost_falls_with_resting_share():
     dynamics, work = simulator.dynamics, []
     for share in (0.0, 0.5, 0.9, 0.99):
         activity = torch.where(torch.arange(N_ROWS) < share * N_ROWS, FROZEN, 0).to(torch.uint8).repeat(4)
-        parts = Parts.of(dataclasses.replace(history, activity=activity), asymmetric=True)
+        parts = Partition.of(dataclasses.replace(history, activity=activity), asymmetric=True)
         background = dynamics.remember(parts.background)
         work.append(sum(multiply_adds(dynamics.net, lambda: dynamics(parts.moving, background=background))))
     assert work[0] > 1.3 * work[1] and work[0] > 4 * work[2] and work[2] > 4 * work[3] > 0
@@ -56,7 +56,7 @@ def test_background_cost_is_below_dynamic_cost():
     simulator, history = make_simulator(), make_history((N_ROWS,) * 4, frozen_share=1.0)
     dynamics, net = simulator.dynamics, simulator.dynamics.net
     thawed = dataclasses.replace(history, activity=torch.zeros_like(history.activity))
-    made = sum(multiply_adds(net, lambda: dynamics.remember(Parts.of(history, asymmetric=True).newest)))
+    made = sum(multiply_adds(net, lambda: dynamics.remember(Partition.of(history, asymmetric=True).newest)))
     assert 3 * made < sum(multiply_adds(net, lambda: dynamics(thawed)))
 
 
@@ -68,7 +68,7 @@ def test_predicted_cost_counts_joint_attention(share):
     history = make_history((n * n,), frozen_share=0.0)
     rests = torch.arange(n * n) < share * n * n
     history = dataclasses.replace(history, means=ground, activity=torch.where(rests, FROZEN, 0).to(torch.uint8))
-    parts, dynamics = Parts.of(history, asymmetric=True), simulator.dynamics
+    parts, dynamics = Partition.of(history, asymmetric=True), simulator.dynamics
     background = dynamics.remember(parts.background)
     *_, counted = multiply_adds(dynamics.net, lambda: dynamics(parts.moving, background=background))
     plan = simulator.plan(EffectsSpec(dynamics=DynamicsEffects(history=1)))

@@ -13,8 +13,7 @@ from gsim3d.compat.released_harmonics import (
     rotate_unpaired_harmonics,
 )
 from gsim3d.compat.released_model import as_released, render_released, with_centered_principal_point
-from gsim3d.dynamics.state import rotate_left
-from gsim3d.math.rotations import rotation_matrices, unit_quats
+from gsim3d.math.rotations import rotate_left, rotation_matrices, unit_quats
 from gsim3d.math.spherical_harmonics import degree_damping, rotate_harmonics, sh_basis
 from gsim3d.nn.gaussian_head import GaussianHead
 from gsim3d.ops.raster import Rendering

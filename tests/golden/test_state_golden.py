@@ -8,7 +8,7 @@ from torch.nn import functional as F
 
 from gsim3d.compat.released_model import ReleasedDynamicsConfig, as_released
 from gsim3d.dynamics import Dynamics, last_steps, rollout
-from gsim3d.dynamics.state import StateLayout
+from gsim3d.dynamics.step import StateLayout
 from gsim3d.math.spherical_harmonics import degree_damping
 from gsim3d.state import FROZEN
 from tests.asserts import relative_to_max

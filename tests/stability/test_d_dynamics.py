@@ -6,7 +6,8 @@ import math
 import pytest
 import torch
 
-from gsim3d.dynamics.state import SCALE_STEP_SHARE, rotate_left
+from gsim3d.dynamics.step import SCALE_STEP_SHARE
+from gsim3d.math.rotations import rotate_left
 from gsim3d.numerics.policy import StabilityConfig
 from gsim3d.numerics.report import StabilityReport
 from gsim3d.numerics.validate import validate_particles

@@ -6,10 +6,20 @@ import pytest
 import torch
 
 from gsim3d.effects.spec import DynamicsEffects, EffectsSpec
+from gsim3d.priors import (
+    ContactConfig,
+    GravityConfig,
+    InertiaConfig,
+    ProximityConfig,
+    SegmentationConfig,
+    ShapeMatchingConfig,
+    VelocityFromImagesConfig,
+)
 from gsim3d.simulator import Simulator
 from gsim3d.testing import invariances
 from gsim3d.testing.invariances import INVARIANCES, Sample, take_scenes
 from tests.dynamics.scenes import EXPLICIT
+from tests.priors.scenes import OCCLUSION
 from tests.test_simulator import CONFIG, awake, make_frames, make_simulator, target_cameras
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -21,9 +31,9 @@ EXPLICIT_CONFIG = dataclasses.replace(
     dynamics=dataclasses.replace(EXPLICIT, grid_size=0.1),
     renderer=dataclasses.replace(CONFIG.renderer, latents=0),
 )
-MORE = {"motion_length": 0.3, "velocity": True, "deformation": True, "lights": ((0.1, 0.2, 1.0),)}
-MOVING = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, **MORE))
-PUSHED = {**MORE, "gravity": (0.0, 0.0, -0.005), "contact_length": 0.15, "pushes": True}
+SEEN = VelocityFromImagesConfig(), InertiaConfig(), ShapeMatchingConfig()
+MOVING = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, priors=(*SEEN, OCCLUSION)))
+PUSHED = (SegmentationConfig(), ProximityConfig(), *SEEN, GravityConfig(), ContactConfig(), OCCLUSION)
 CONFIGS = {"latent": CONFIG, "explicit": EXPLICIT_CONFIG, "moving": MOVING}
 
 
@@ -64,7 +74,7 @@ def test_invariance_for_every_background(name, background, device, simulators):
 # Bodies of noise that are stopped amplify the rounding of sums in another order: of rows in another one.
 @pytest.mark.parametrize("name", [name for name in INVARIANCES if name != "permute particles"])
 def test_invariance_with_contact(name, device):
-    config = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, **PUSHED))
+    config = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, priors=PUSHED))
     # Products of a GPU are rounded by the batch: one step does not amplify that.
     sample = make_sample(device, n_steps=1 if device != "cpu" and name == "split the batch" else 3)
     broken = [str(x) for x in INVARIANCES[name](awake(make_simulator(config)).to(device), sample) if not x.holds]

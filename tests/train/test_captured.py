@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from gsim3d.compat.checkpoints import OCCLUSION
 from gsim3d.cuda_graphs import Captured
 from gsim3d.data import Scene, find_scenes
 from gsim3d.errors import CaptureError, InputError
@@ -40,19 +41,21 @@ def scenes(tmp_path_factory):
 
 MOVING = dataclasses.replace(
     CONFIG,
-    model={"dynamics": {"motion_length": 0.3}},
+    model={"dynamics": {"priors": [{"type": "inertia"}]}},
     effects={"appearance": {"changing": "frozen"}},
 )
 RELIGHTABLE = dataclasses.replace(
     MOVING,
     model={
         "dynamics": {
-            "motion_length": 0.3,
-            "velocity": True,
             "background": "relightable",
-            "position_waves": 2,
-            "contact_length": 0.15,
-            "lights": ((0.1, 0.2, 1.0),),
+            "priors": [
+                {"type": "velocity_from_images"},
+                {"type": "position_waves", "count": 2},
+                {"type": "proximity"},
+                {"type": "inertia"},
+                {"type": "directional_light", "directions": [[0.1, 0.2, 1.0]], **OCCLUSION},
+            ],
         }
     },
 )
@@ -60,15 +63,25 @@ FLYING = dataclasses.replace(
     RELIGHTABLE,
     model={
         "dynamics": {
-            **RELIGHTABLE.model["dynamics"], "deformation": True, "surfaces": True, "gravity": (0.0, 0.0, -0.005),
-            "pushes": True,
+            "background": "relightable",
+            "priors": [
+                {"type": "segmentation"},
+                {"type": "velocity_from_images"},
+                {"type": "position_waves", "count": 2},
+                {"type": "proximity"},
+                {"type": "inertia"},
+                {"type": "shape_matching"},
+                {"type": "gravity"},
+                {"type": "contact"},
+                {"type": "directional_light", "directions": [[0.1, 0.2, 1.0]]},
+            ],
         }
     },
     effects={"appearance": {"changing": "dynamic"}},
 )  # fmt: skip
 ALL_MOVING = dataclasses.replace(
     MOVING,
-    model={"dynamics": {"motion_length": 0.3, "velocity": True, "deformation": True}},
+    model={"dynamics": {"priors": [{"type": "velocity_from_images"}, {"type": "inertia"}, {"type": "shape_matching"}]}},
     effects={"dynamics": {"background": "dynamic"}},
 )
 KINDS = {
@@ -86,7 +99,9 @@ KINDS = {
 def trainer(scenes, tmp_path, device, request):
     trainer = Trainer(KINDS[request.param], scenes, tmp_path, device=device.type)
     with torch.no_grad():
-        for parameter in trainer.simulator.dynamics.net.head.parameters():
+        dynamics = trainer.simulator.dynamics
+        gains = [prior.gain_head for prior in dynamics.priors if prior.gain_head]
+        for parameter in (p for module in (dynamics.net.head, *gains) for p in module.parameters()):
             parameter.normal_(0, 0.02, generator=torch.Generator(parameter.device).manual_seed(0))
     return trainer
 

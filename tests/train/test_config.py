@@ -17,6 +17,7 @@ from gsim3d.effects.edits import load_edits
 from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError
 from gsim3d.io.settings import from_dict, load_yaml, to_dict, upgraded
+from gsim3d.priors import PriorConfig
 from gsim3d.train import restore
 from gsim3d.train.config import DataConfig, PhaseConfig, TrainConfig
 from gsim3d.train.restore import build_simulator, model_config
@@ -105,7 +106,11 @@ def test_every_number_of_a_run_has_a_finite_range(tmp_path, text):
     "content, message",
     [
         ({"dynamics": {"grid_size": float("inf")}}, "model.dynamics.grid_size: must be a number"),
-        ({"dynamics": {"gravity": [0, 0, float("nan")]}}, r"model.dynamics.gravity\[2\]: must be a number"),
+        (
+            {"dynamics": {"priors": [{"type": "gravity", "acceleration": [0, 0, float("nan")]}]}},
+            r"model.dynamics.priors\[0\].acceleration\[2\]: must be a number",
+        ),
+        ({"dynamics": {"priors": [{"type": "wind"}]}}, r"model.dynamics.priors\[0\].type: must be one of"),
         ({"stability": {"max_speed": 1e39}}, "model.stability.max_speed: must be a number"),
         ({"encoder": {"n_depths": 2**70}}, "model.encoder.n_depths: must be a whole number"),
         ({"encoder": {"cnn_dims": [-3, 32]}}, "encoder: cnn_dims must be at least 1"),
@@ -134,10 +139,15 @@ def test_every_number_of_a_model_has_a_finite_range():
                 content = {part: {name: [bad, *items[1:]] if isinstance(value, list) else bad}}
                 with pytest.raises(InputError, match=rf"^model\.{part}"):
                     model_config(TrainConfig(model=content))
-    lengths = {"motion_length": -1.0, "contact_length": 1e30, "gravity": [0, 0, 1e30], "lights": [[1e30, 0, 1]]}
-    for name, bad in lengths.items():
-        with pytest.raises(InputError, match=name):
-            model_config(TrainConfig(model={"dynamics": {name: bad}}))
+    for kind, variant in PriorConfig.VARIANTS.items():
+        for name, value in to_dict(variant()).items():
+            items = value if isinstance(value, list) else [value]
+            if isinstance(items[0], (bool, str)) or name == "version":
+                continue
+            for bad in (math.inf, math.nan, 1e30):
+                bad = [[bad, 0, 1]] if isinstance(items[0], list) else [bad, *items[1:]] if value is items else bad
+                with pytest.raises(InputError, match=name):
+                    model_config(TrainConfig(model={"dynamics": {"priors": [{"type": kind, name: bad}]}}))
 
 
 def doubled(levels, line="a{i}: &a{i} [*a{b}, *a{b}]"):

@@ -315,8 +315,9 @@ def test_recipes_are_sound(world, arm):
     assert stream.n_frames >= data.history + max(phase.horizon for phase in phases)
     assert made.train.n_steps >= 1_000_000
     model = build_simulator(model_config(made.train), 0).config.dynamics  # raises where switches do not agree
-    hand_made = model.position_features, model.motion_length is not None, model.pushes
-    expected = {"pure": (0, 0, 0), "positions": (1, 0, 0), "motion": (0, 1, 0), "priors": (1, 1, world != "cloth")}
+    kinds = [prior.type for prior in model.priors]
+    hand_made = model.position_features, "inertia" in kinds, "contact" in kinds
+    expected = {"pure": (0, 0, 0), "positions": (1, 0, 0), "priors": (1, 1, world != "cloth")}
     assert hand_made == expected[arm]
 
 
@@ -337,7 +338,7 @@ def test_validation_is_of_the_recipes_own_world_with_another_seed():
 
 def test_line_of_a_skipped_step():
     entry = {"step": 7, "loss": math.nan, "grad_norm": math.inf, "learning_rate": 1e-3, "future_psnr": math.nan}
-    why = "the gradient is not finite, first that of dynamics.gravity"
+    why = "the gradient is not finite, first that of dynamics.priors.gravity.acceleration"
     said = runs.line(plain({**entry, "skipped": why}), {"step_seconds": 0.1, "memory_gib": 1.0})
     assert said == f"step      7  skipped: {why}"
 

@@ -19,7 +19,7 @@ from harness import Bench
 from gsim3d import presets
 from gsim3d.cameras import Cameras
 from gsim3d.cuda_graphs import CapturedRollout
-from gsim3d.dynamics import Parts, RestLog, append_step, last_steps
+from gsim3d.dynamics import Partition, RestLog, append_step, last_steps
 from gsim3d.simulator import Simulator
 from gsim3d.state import DYNAMIC, FROZEN, Particles
 
@@ -108,7 +108,7 @@ def on_gpu(bench: Bench, n: int = 65536, n_steps: int = 4, horizon: int = 12) ->
                 ours, graph = captured(share, cameras)
                 options["graphs"] = {"gsim3d": graph, "nothing rests": graph_awake}
                 bench.gpu(case, "bfloat16", ours, {"nothing rests": awake}, tolerance=None, **options)
-        rests = Parts.of(scene(model, n_steps, n, 0.9, "cuda"), asymmetric=True).background
+        rests = Partition.of(scene(model, n_steps, n, 0.9, "cuda"), asymmetric=True).background
         bench.gpu("the background, 59k points", "bfloat16", lambda: model.dynamics.remember(rests), {}, capture=False)
         decibels = agreement(model, scene(model, n_steps, n, 0.9, "cuda"), horizon, "cuda")
         print(f"agreement of {horizon} steps with a background made in every step: {decibels:.1f} dB")
@@ -127,10 +127,10 @@ def timed(f):
 @torch.no_grad()
 def on_cpu(bench: Bench, n: int = 6000, n_steps: int = 2, horizon: int = 4) -> None:
     model = simulator(n_steps, "cpu")
-    dynamics, awake = model.dynamics, Parts.of(scene(model, n_steps, n, 0.0, "cpu"), asymmetric=True)
+    dynamics, awake = model.dynamics, Partition.of(scene(model, n_steps, n, 0.0, "cpu"), asymmetric=True)
     nothing, saved, made = dynamics.remember(awake.background), {}, {}
     for share in SHARES:
-        parts = Parts.of(scene(model, n_steps, n, share, "cpu"), asymmetric=True)
+        parts = Partition.of(scene(model, n_steps, n, share, "cpu"), asymmetric=True)
         background = dynamics.remember(parts.background)
         row = bench.compare(
             f"a step, {share:.0%} of {n} rows rest",

@@ -65,6 +65,8 @@ def recipe(world: str, arm: str = "pure") -> Recipe:
     settings = load_yaml(CONFIGS / f"{world}.yaml")
     for part in ("all", world):
         settings = merged(settings, arms[arm].get(part, {}))
+    if arm == "priors":
+        settings = merged(settings, {"model": {"dynamics": load_yaml(CONFIGS.parent / "priors" / f"{world}.yaml")}})
     return Recipe(f"{world}-{arm}", world, from_dict(TrainConfig, settings))
 
 

@@ -1,0 +1,87 @@
+"""A history in two parts: the rows that a call of the network advances, and those that rest meanwhile."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsim3d.state import ASLEEP, FROZEN, CloudTable, Particles, last_steps, newest_clouds
+
+
+@dataclass(frozen=True)
+class Partition:
+    """What moves and what rests. Scenes in which nothing moves are in neither part.
+
+    newest: the last cloud of every scene, with all its rows.
+    moving: all clouds, the rows that move.
+    background: the rows of the newest clouds that rest and are seen; None where the network does not tell them apart.
+    rows: int64, the rows of ``newest`` that the newest clouds of ``moving`` hold.
+    """
+
+    newest: Particles
+    moving: Particles
+    background: Particles | None
+    rows: Tensor
+
+    @classmethod
+    def of(cls, history: Particles, *, asymmetric: bool, asleep: Tensor | None = None) -> Partition:
+        """Waits for the device, to count rows.
+
+        Args:
+            history: clouds sorted by (scene, step).
+            asymmetric: frozen rows rest, and what rests is a background; else frozen rows move with the others (their
+                latents do), and only whole scenes may be asleep.
+            asleep: bool, rows of the newest clouds that rest as well. The clouds of a scene then have the same rows.
+        """
+        newest, background = last_steps(history, 1), None
+        if not asymmetric and asleep is None:
+            return cls(newest, _awake(history), None, torch.arange(newest.n_rows, device=newest.means.device))
+        rests = history.activity == FROZEN if asymmetric else torch.zeros_like(history.activity, dtype=torch.bool)
+        if asleep is not None:
+            rests = rests | _in_every_cloud(history, newest, asleep)
+        moving = _awake(history.select_rows(~rests))
+        newest_rests = last_steps(_marked(history, rests), 1).activity > 0
+        if asymmetric:
+            awake = set(moving.clouds.scenes)
+            background = newest.select_rows(newest_rests & (newest.activity != ASLEEP))
+            background = background.select_clouds([q for q, s in enumerate(newest.clouds.scenes) if s in awake])
+        return cls(newest, moving, background, torch.nonzero(~newest_rests)[:, 0])
+
+    @property
+    def nothing_moves(self) -> bool:
+        return self.moving.n_clouds == 0
+
+    def whole(self, step: Particles | None, ahead: int) -> Particles:
+        """All rows of every scene ``ahead`` steps after the newest; ``step``: those that move, None where none do."""
+        table = self.newest.clouds
+        counts = [table.count(q) for q in range(len(table))]
+        later = CloudTable.make(counts, table.scenes, (s + ahead for s in table.steps), self.newest.cu_rows.device)
+        if step is None:
+            return self.newest.with_clouds(later)
+        if self.rows.shape[0] == self.newest.n_rows:  # all move
+            return step.with_clouds(later)
+        fields = self.newest.row_fields()
+        del fields["static_latents"]
+        changed = {name: value.index_copy(0, self.rows, getattr(step, name)) for name, value in fields.items()}
+        return self.newest.with_clouds(later, **changed)
+
+
+def _awake(moving: Particles) -> Particles:
+    """The clouds of scenes whose newest one has rows."""
+    table = moving.clouds
+    awake = {table.scenes[q] for q in newest_clouds(table) if table.count(q) > 0}
+    kept = [q for q, scene in enumerate(table.scenes) if scene in awake]
+    return moving if len(kept) == len(table) else moving.select_clouds(kept)
+
+
+def _in_every_cloud(history: Particles, newest: Particles, asleep: Tensor) -> Tensor:
+    """bool [N] of ``history``: each cloud marked as the newest one of its scene is."""
+    table, starts = history.clouds, dict(zip(newest.clouds.scenes, zip(newest.clouds.starts, newest.clouds.starts[1:])))
+    marks = [asleep[slice(*starts[scene])] for scene in table.scenes]
+    return torch.cat(marks) if marks else asleep
+
+
+def _marked(history: Particles, rows: Tensor) -> Particles:
+    return history.with_clouds(history.clouds, activity=rows.to(torch.uint8))

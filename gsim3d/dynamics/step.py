@@ -1,0 +1,268 @@
+"""What the network reads of a particle, what it predicts, and how a prediction becomes the next state."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsim3d.dynamics.config import DynamicsConfig
+from gsim3d.math.rotations import rotate_left, unit_quats
+from gsim3d.math.spherical_harmonics import degree_damping
+from gsim3d.nn.layers import widened
+from gsim3d.priors import Prior
+from gsim3d.priors.base import bounded
+from gsim3d.state import FROZEN, Particles
+
+SCALE_STEP_SHARE = 1 / 6  # of the range of scales, the most that one step changes a scale
+POSITION_CHANNELS = 6
+APPEARANCE = ("dynamic_latents", "sh", "irradiance_gain")  # attributes that frozen_appearance keeps
+
+
+@dataclass(frozen=True)
+class StateLayout:
+    """Order and width of the network's channels: attributes that change, then those that do not, by the alphabet.
+
+    Harmonics are flat as (3, K), quaternions as (x, y, z, w); a difference of rotations is predicted as a rotation
+    vector about world axes. Outputs repeat for every step of a call; behind them come the gains of priors.
+
+    Attributes:
+        config: of the model.
+        inputs, outputs: (attribute, channels).
+        gains: (prior, channels, attribute that they change).
+    """
+
+    config: DynamicsConfig
+    inputs: tuple[tuple[str, int], ...]
+    outputs: tuple[tuple[str, int], ...]
+    gains: tuple[tuple[str, int, str], ...] = ()
+
+    @classmethod
+    def of(cls, config: DynamicsConfig, priors: Iterable[Prior] = ()) -> StateLayout:
+        dynamic, static, priors = config.dynamic_latents, config.static_latents, list(priors)
+        means = 0 if any(prior.replaces_displacement for prior in priors) else 3
+        if not config.explicit:
+            inputs = [("dynamic_latents", dynamic), ("opacities", 1), ("static_latents", static)]
+            outputs = [("dynamic_latents", dynamic), ("means", means)]
+        else:
+            sh = 3 * (config.sh_degree + 1) ** 2
+            inputs = [("dynamic_latents", dynamic), ("sh", sh), ("opacities", 1), ("quats", 4), ("scales", 3)]
+            inputs += [("static_latents", static)]
+            rotation = 4 if config.predicts == "absolute" else 3
+            outputs = [("dynamic_latents", dynamic), ("sh", sh), ("means", means), ("opacities", 1)]
+            outputs += [("quats", rotation), ("scales", 3)]
+        inputs, outputs = (tuple((name, n) for name, n in fields if n > 0) for fields in (inputs, outputs))
+        gains = tuple((prior.name, prior.n_gains, prior.gains_change) for prior in priors if prior.n_gains)
+        return cls(config, inputs, outputs, gains)
+
+    @property
+    def in_channels(self) -> int:
+        return sum(n for _, n in self.inputs) + POSITION_CHANNELS * self.config.position_features
+
+    @property
+    def out_channels(self) -> int:
+        """Without gains."""
+        return self.config.steps_per_call * sum(n for _, n in self.outputs)
+
+    def changes(self, features: str = "all", opacities: bool = True) -> dict[str, str]:
+        """For each predicted attribute, of which particles a step changes it: "all", "dynamic", "frozen" or "none".
+
+        Args:
+            features: whose latents and colours change. Those of frozen particles may: a shadow may fall on them.
+            opacities: whether they change, where they are predicted.
+        """
+        names = [name for name, _ in self.outputs] + ["means"] + [changed for *_, changed in self.gains]
+        who = {name: features if name in APPEARANCE else "dynamic" for name in names}
+        if "opacities" in who and not opacities:
+            who["opacities"] = "none"
+        if "quats" in who and self.config.frozen_turn:
+            who["quats"] = "all"
+        return who
+
+    def _columns(self, changes: Mapping[str, str]) -> list[tuple[str, int, bool]]:
+        """(output or prior, channels, whether it is computed) in the order of the network's outputs."""
+        outputs = [(name, n, changes[name] != "none") for name, n in self.outputs]
+        return outputs * self.config.steps_per_call + [
+            (prior, n, changes[changed] != "none") for prior, n, changed in self.gains
+        ]
+
+    def columns(self, changes: Mapping[str, str]) -> list[tuple[int, int]] | None:
+        """Runs of output channels that ``changes`` asks for; None: all of them."""
+        runs, begin = [], 0
+        for _, n, computed in self._columns(changes):
+            if computed:
+                runs.append((runs.pop()[0] if runs and runs[-1][1] == begin else begin, begin + n))
+            begin += n
+        return None if runs == [(0, begin)] else runs
+
+    def split(self, prediction: Tensor, changes: Mapping[str, str]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """The outputs [S, N, channels] for S steps, and the gains of priors [N, channels], those that are computed."""
+        computed = [(name, n) for name, n, computed in self._columns(changes) if computed]
+        parts = widened(prediction).split([n for _, n in computed], 1)
+        priors, outputs, gains = {name for name, *_ in self.gains}, {}, {}
+        for (name, _), part in zip(computed, parts, strict=True):
+            if name in priors:
+                gains[name] = part
+            else:
+                outputs.setdefault(name, []).append(part)
+        return {name: torch.stack(steps) for name, steps in outputs.items()}, gains
+
+    def pack(self, particles: Particles) -> Tensor:
+        """[N, in_channels] of all particles."""
+        config, columns = self.config, []
+        for name, n in self.inputs:
+            value = getattr(particles, name)
+            if value is None or value[:1].numel() != n * min(1, particles.n_rows):
+                got = "None" if value is None else list(value.shape)
+                raise ValueError(f"Dynamics: particles.{name} must have {n} channels a row; got {got}")
+            columns.append(_flat(name, value))
+        if config.position_features:
+            columns.append(position_features(particles, config.grid_size, config.position_length))
+        return torch.cat(columns, 1)
+
+    def displacements(self, particles: Particles, outputs: Mapping[str, Tensor]) -> Tensor:
+        """[S, N, 3] metres, from the newest positions to those after 1, 2, ... steps, as predicted without gains."""
+        if "means" not in outputs:
+            return torch.zeros_like(particles.means)[None]
+        return self._differences("means", particles.means, outputs["means"])
+
+    def advance(
+        self,
+        particles: Particles,
+        outputs: Mapping[str, Tensor],
+        displacements: Tensor,
+        awake: Tensor | None = None,
+        changes: Mapping[str, str] | None = None,
+    ) -> list[Particles]:
+        """The particles after 1, 2, ... ``steps_per_call`` steps.
+
+        Args:
+            particles: N, the newest state; those of ``frozen_appearance`` keep their latents and colours.
+            outputs: as :meth:`split` returns them.
+            displacements: [S, N, 3] metres.
+            awake: bool [N], particles that change at all; None: all.
+            changes: of :meth:`changes`; None: all that is predicted.
+        """
+        changes = changes or self.changes()
+        share = self.share(particles, "means", changes["means"], awake)
+        later = {"means": _hold(share, particles.means, particles.means + share * displacements)}
+        for name in (name for name in outputs if name != "means"):
+            share = self.share(particles, name, changes[name], awake)
+            later[name] = self.later_values(name, getattr(particles, name), outputs[name], share)
+        return [
+            dataclasses.replace(particles, **{name: values[step] for name, values in later.items()})
+            for step in range(self.config.steps_per_call)
+        ]
+
+    @staticmethod
+    def share(particles: Particles, name: str, who: str, awake: Tensor | None) -> Tensor:
+        """[N, 1], 1 for particles whose attribute ``name`` changes where it does for ``who``, 0 for others."""
+        frozen = particles.activity == FROZEN
+        rows = {"all": torch.ones_like(frozen), "dynamic": ~frozen, "frozen": frozen}.get(who, torch.zeros_like(frozen))
+        if awake is not None:
+            rows = rows & awake
+        if name in APPEARANCE and particles.frozen_appearance is not None:
+            rows = rows.masked_fill(particles.frozen_appearance, False)
+        return rows[:, None].to(particles.means)
+
+    def later_values(self, name: str, newest: Tensor, predicted: Tensor, share: Tensor) -> Tensor:
+        """[S, N, ...], one attribute after each step of a call.
+
+        Args:
+            name: of the attribute.
+            newest: [N, ...], its newest values.
+            predicted: [S, N, channels].
+            share: [N, 1], how much of a predicted change happens: 0 holds the value, bit by bit.
+        """
+        if name == "quats":
+            return self._later_quats(newest, predicted, share)
+        share = share.reshape(*share.shape[:-1], *(1,) * (newest.dim() - 1))
+        changed = newest + share * self._differences(name, newest, predicted)
+        return _hold(share, newest, self._in_range(name, changed))
+
+    def _differences(self, name: str, newest: Tensor, predicted: Tensor) -> Tensor:
+        """[S, N, ...], by how much an attribute differs from its newest values after each step."""
+        predicted = _unflat(name, predicted)
+        changes = self._target(name, predicted) - newest if self._absolute else self._change(name, predicted)
+        return changes.cumsum(0) if self.config.predicts == "from_previous" else changes
+
+    @property
+    def _absolute(self) -> bool:
+        return self.config.predicts == "absolute"
+
+    def _change(self, name: str, predicted: Tensor) -> Tensor:
+        config = self.config
+        if name == "means":
+            return bounded(predicted, config.max_step)
+        if name == "dynamic_latents":
+            return bounded(predicted, config.max_latent_step)
+        if name == "scales" and config.max_step is not None:
+            return bounded(predicted, SCALE_STEP_SHARE * (config.scale_max - config.scale_min))
+        return self._damped(predicted) if name == "sh" else predicted
+
+    def _target(self, name: str, predicted: Tensor) -> Tensor:
+        config = self.config
+        if name == "opacities":
+            return predicted.sigmoid()
+        if name == "scales":
+            return config.scale_min + (config.scale_max - config.scale_min) * predicted.sigmoid()
+        return self._damped(predicted) if name == "sh" else predicted
+
+    def _damped(self, sh: Tensor) -> Tensor:
+        return sh * degree_damping(self.config.sh_degree, sh)[:, None]
+
+    def _in_range(self, name: str, value: Tensor) -> Tensor:
+        if name == "scales":
+            return value.clamp(self.config.scale_min, self.config.scale_max)
+        if name == "opacities":
+            return value.clamp(0, self.config.max_opacity)
+        return value
+
+    def _later_quats(self, newest: Tensor, predicted: Tensor, share: Tensor) -> Tensor:
+        """As :meth:`later_values`, of rotations: unit quaternions, except where nothing changes."""
+        if self._absolute:
+            target = predicted.roll(1, 2)
+            return _hold(share, newest, unit_quats(newest + share * (target - newest)))
+        later, before = [], newest
+        for vectors in (share * predicted).unbind(0):
+            later.append(rotate_left(before, vectors))
+            before = later[-1] if self.config.predicts == "from_previous" else newest
+        return _hold(share, newest, torch.stack(later))
+
+
+def _flat(name: str, value: Tensor) -> Tensor:
+    """A field of Particles as [N, channels], in the order that published weights expect."""
+    if name == "sh":
+        return value.mT.flatten(1)
+    if name == "quats":
+        return value.roll(-1, 1)
+    return value.flatten(1) if value.dim() > 1 else value[:, None]
+
+
+def _unflat(name: str, value: Tensor) -> Tensor:
+    """[S, N, channels] -> [S, N, ...] as in Particles."""
+    if name == "sh":
+        return value.unflatten(2, (3, -1)).mT
+    return value[:, :, 0] if name == "opacities" else value
+
+
+def position_features(particles: Particles, grid_size: float, length: float) -> Tensor:
+    """[N, 6]: position relative to the scene's origin in units of ``length``; position inside the cell, -1 to 1."""
+    relative = _from_origin(particles)
+    with torch.no_grad():
+        corner = torch.floor(relative / grid_size) * grid_size
+    inside = (relative - corner) * (2 / grid_size) - 1
+    return torch.cat([relative / length, inside], 1).to(particles.means.dtype)
+
+
+def _from_origin(particles: Particles) -> Tensor:
+    """float64 [N, 3]."""
+    return particles.means.double() - particles.origin[particles.cloud_scene[particles.row_cloud()]]
+
+
+def _hold(share: Tensor, newest: Tensor, later: Tensor) -> Tensor:
+    """``newest`` where the share is 0: the same bits, and no gradient into the prediction."""
+    return torch.where(share > 0, later, newest)

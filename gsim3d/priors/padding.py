@@ -1,0 +1,205 @@
+"""Particles of one cloud of every scene as padded batches whose sizes are known without waiting for the device.
+
+Letters: B scenes, M padded particles, m compacted ones, S samples, G nodes.
+"""
+
+from __future__ import annotations
+
+import copy
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+from torch.nn import functional as F
+
+from gsim3d.ops.validate_state import CELLS
+from gsim3d.state import DYNAMIC, Particles, constant
+
+SAMPLES = 1024  # of a subset, evenly spread over its list
+LEAST_LOGIT = -60.0  # of a weight: a CPU takes many times as long for numbers that are almost 0
+
+
+class PaddedClouds:
+    """One cloud of every scene, padded to the largest.
+
+    Attributes:
+        rows: int64 [B, M], indices of particles.
+        positions: float64 [B, M, 3] metres from the origins of the scenes.
+        is_inside: bool [B, M], particles within the workspace; False for padding.
+    """
+
+    def __init__(self, history: Particles, chosen: list[int], grid_size: float):
+        table, device = history.clouds, history.means.device
+        starts, counts, scenes = (
+            constant(tuple(of[q] for q in chosen), device)
+            for of in (table.starts, [table.count(q) for q in range(len(table))], table.scenes)
+        )
+        index = torch.arange(max(1, max(table.count(q) for q in chosen)), device=device)
+        self.rows = (starts[:, None] + index).clamp(max=history.n_rows - 1)
+        self.positions = history.means.detach()[self.rows].double() - history.origin[scenes][:, None]
+        inside = ((self.positions >= 0) & (self.positions / grid_size < CELLS)).all(2)  # False for NaN
+        self.is_inside = (index < counts[:, None]) & inside
+
+
+class Subset:
+    """Particles of padded clouds with one activity.
+
+    Attributes:
+        rows: int64 [B, M], indices of particles.
+        known: bool [B, M], members; at least as opaque as ``opacity``.
+        positions: [B, M, 3] metres from the origins of the scenes, 0 for others.
+    """
+
+    def __init__(self, clouds: PaddedClouds, history: Particles, activity: int = DYNAMIC, opacity: float = 0.0):
+        self._clouds, self._history, self.rows = clouds, history, clouds.rows
+        self.known = clouds.is_inside & (history.activity[self.rows] == activity)
+        if opacity > 0:
+            self.known = self.known & (history.opacities.detach()[self.rows] >= opacity)
+        self.positions = torch.where(self.known[:, :, None], clouds.positions, 0).to(history.means.dtype)
+
+    def compacted(self, compact: Compact) -> Subset:
+        """[B, m] members that ``compact`` keeps."""
+        if compact.known is self.known:
+            return self
+        some = copy.copy(self)
+        some.rows, some.positions, some.known = compact.take(self.rows), compact.take(self.positions), compact.known
+        return some
+
+    def other(self, activity: int, opacity: float = 0.0) -> Subset:
+        """Another subset of the same clouds."""
+        return Subset(self._clouds, self._history, activity, opacity)
+
+
+class Compact:
+    """Stable compaction of a padded batch [B, M] -> [B, m] by a mask.
+
+    m is ``max_count``, or the exact maximum on a CPU; on a GPU without ``max_count`` m = M, which waits for nothing.
+
+    Attributes:
+        known: bool [B, m].
+    """
+
+    def __init__(self, mask: Tensor, max_count: int | None = None):
+        if max_count is None and mask.device.type == "cpu" and not torch.compiler.is_compiling():
+            max_count = int(mask.sum(1).max())
+        self.known, self._mask, self._at = mask, mask, None
+        if max_count is not None:
+            until, k = mask.cumsum(1), torch.arange(max(1, max_count), device=mask.device)
+            self.known = k < until[:, -1:]
+            self._at = torch.searchsorted(until, (k + 1).repeat(len(until), 1)).clamp(max=until.shape[1] - 1)
+            self._rank = (until - 1).clamp(0, max(1, max_count) - 1)
+
+    def take(self, values: Tensor) -> Tensor:
+        """[B, m, ...] of ``values`` [B, M, ...]; 0 for padding."""
+        if self._at is None:
+            return values
+        return _take_flat(values, self._at, self.known, self._rank, self._mask)
+
+    def put(self, values: Tensor) -> Tensor:
+        """[B, M, ...] of ``values`` [B, m, ...]; 0 outside of the mask."""
+        if self._at is None:
+            return torch.where(self._mask.reshape(*self._mask.shape, *(1,) * (values.dim() - 2)), values, 0)
+        return _take_flat(values, self._rank, self._mask, self._at, self.known)
+
+
+def _take_flat(values: Tensor, *indices: Tensor) -> Tensor:
+    """_Take, of ``values`` [B, M, ...]."""
+    return _Take.apply(values.reshape(*values.shape[:2], -1), *indices).reshape(len(values), -1, *values.shape[2:])
+
+
+class Samples:
+    """All members of a subset, or ``SAMPLES`` of them, evenly spread over their list.
+
+    Attributes:
+        n: int64 [B], members.
+        known: bool [B, S], entries that are samples; others are 0.
+        positions: [B, S, 3] metres.
+        mean: [B, 3], of the positions.
+    """
+
+    def __init__(self, subset: Subset):
+        self._rows, self._mask, self._until = subset.rows, subset.known, subset.known.cumsum(1)
+        self.n = self._until[:, -1]
+        k = torch.arange(SAMPLES, device=self.n.device)
+        self.known = k < self.n[:, None]
+        self._at = torch.searchsorted(self._until, self._rank(k) + 1).clamp(max=self._until.shape[1] - 1)
+        self.positions = torch.where(
+            self.known[:, :, None], subset.positions.gather(1, self._at[:, :, None].expand(-1, -1, 3)), 0
+        )
+        self.mean = self.mean_of(self.positions)
+
+    def _rank(self, k: Tensor) -> Tensor:
+        """Of sample ``k`` in the list of members."""
+        n = self.n[:, None]
+        return torch.where(n > SAMPLES, k * n // SAMPLES, k)
+
+    def take(self, values: Tensor) -> Tensor:
+        """[B, S, C] of ``values`` [B, M, C] of the subset; 0 for padding."""
+        rank, n = self._until - 1, self.n[:, None]
+        k = torch.where(n > SAMPLES, (rank * SAMPLES + n - 1) // n.clamp(min=1), rank).clamp(0, SAMPLES - 1)
+        is_sample = self._mask & (self._rank(k) == rank)
+        return _Take.apply(values, self._at, self.known, k, is_sample)
+
+    def center(self, center: Tensor) -> None:
+        """Counts positions from ``center`` [B, 1, 3]: squares of large coordinates would be all rounding."""
+        self.positions = torch.where(self.known[:, :, None], self.positions - center, 0)
+        self.mean = self.mean - center[:, 0]
+
+    def mean_of(self, values: Tensor) -> Tensor:
+        """[B, C], the mean of ``values`` [B, S, C]."""
+        return torch.where(self.known[:, :, None], values, 0).sum(1) / self.n.clamp(1, SAMPLES)[:, None]
+
+    def density(self, radius: float) -> Tensor:
+        """[B, S], samples in a Gaussian window of ``radius`` metres around each, itself one of them."""
+        near = gaussian(squared_distances(self.positions, self.positions), radius)
+        return (near * self.known[:, None]).sum(2).clamp(min=1)
+
+
+class _Take(torch.autograd.Function):
+    """Entries ``at``, each taken once: entry i as number k[i], where ``is_taken``. So its gradient is taken, too; that
+    of gather waits for the device where it has to be deterministic."""
+
+    @staticmethod
+    def forward(ctx, values: Tensor, at: Tensor, known: Tensor, k: Tensor, is_taken: Tensor) -> Tensor:
+        ctx.save_for_backward(k, is_taken)
+        return torch.where(known[:, :, None], values.gather(1, at[:, :, None].expand(-1, -1, values.shape[2])), 0)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None, None, None, None]:
+        k, is_taken = ctx.saved_tensors
+        taken = grad.gather(1, k[:, :, None].expand(-1, -1, grad.shape[2]))
+        return torch.where(is_taken[:, :, None], taken, 0), None, None, None, None
+
+
+def weights(logits: Tensor, known: Tensor) -> Tensor:
+    """[B, G, S], the softmax of ``logits`` [B, G, S] over the ``known`` [B, S]; 0 where there are none."""
+    known = known[:, None]
+    logits = torch.where(known, logits, -torch.inf)
+    logits = (logits - logits.amax(2, keepdim=True)).clamp(min=LEAST_LOGIT)
+    return torch.where(known, logits, -torch.inf).softmax(2).nan_to_num(0)
+
+
+def gaussian(squared: Tensor, radius: float) -> Tensor:
+    """exp(-d^2 / 2 radius^2) of squared distances."""
+    return (squared * (-0.5 / radius**2)).clamp(min=LEAST_LOGIT).exp()
+
+
+def in_blocks(values: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
+    """``values`` [B, N, C] in blocks of one size, [B K, SAMPLES, C], and for each block its part of ``others``
+    [B, ...]: bits of matrix products then do not depend on the sizes of other scenes. Back: :func:`from_blocks`."""
+    k = -(-values.shape[1] // SAMPLES)
+    values = F.pad(values, (0, 0, 0, k * SAMPLES - values.shape[1])).unflatten(1, (k, SAMPLES))
+    others = (x[:, None].expand(-1, k, *x.shape[1:]) for x in others)
+    return tuple(x.flatten(0, 1).contiguous() for x in (values, *others))
+
+
+def from_blocks(blocks: Tensor, like: Tensor) -> Tensor:
+    """[B, N, ...] of ``blocks`` [B K, SAMPLES, ...], for ``like`` [B, N, C]."""
+    return blocks.unflatten(0, (len(like), -1)).flatten(1, 2)[:, : like.shape[1]]
+
+
+def squared_distances(a: Tensor, b: Tensor) -> Tensor:
+    """[B, G, S] between [B, G, C] and [B, S, C]."""
+    found = torch.baddbmm(b.square().sum(2)[:, None], a, b.mT, alpha=-2)
+    return found.add_(a.square().sum(2)[:, :, None]).clamp_(min=0)

@@ -1,0 +1,208 @@
+"""Particles that carry their velocity, and the momentum of the matter around them."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from gsim3d.dynamics import last_steps, rollout, with_attribute
+from gsim3d.effects.edits import Rotate
+from gsim3d.math.rotations import rotation_matrices
+from gsim3d.priors import InertiaConfig
+from gsim3d.priors.inertia import rotate_with_window
+from gsim3d.state import DYNAMIC, FROZEN
+from tests.asserts import assert_close_relative_to_max, assert_same_bits
+from tests.dynamics.scenes import TINY, batch, make_dynamics, make_history
+from tests.priors.scenes import build, context, windows, with_priors
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+LENGTH = 0.2
+CARRYING = with_priors(TINY, InertiaConfig(radius=LENGTH))
+VELOCITY, SPIN = (0.03, -0.02, 0.05), (0.0, 0.08, 0.04)
+
+
+def velocities(history, radius=LENGTH, priors=None):
+    ctx = context(history, InertiaConfig(radius=radius), grid_size=TINY.grid_size, priors=priors)
+    return ctx.priors.get("inertia").velocities(ctx)
+
+
+def cross_matrix(w):
+    return torch.linalg.cross(torch.tensor(w).expand(3, 3), torch.eye(3)).T
+
+
+def turning(n_steps, n=200, velocity=VELOCITY, spin=SPIN, seed=0):
+    """A ball of 20 cm that flies and turns, seen in ``n_steps``."""
+    g = torch.Generator().manual_seed(seed)
+    ball = torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=1) * 0.2
+    history = make_history((n,) * n_steps, seed=seed, frozen_share=0.0)
+    steps = [
+        1.0 + k * torch.tensor(velocity) + ball @ torch.linalg.matrix_exp(k * cross_matrix(spin)).T
+        for k in range(n_steps)
+    ]
+    return dataclasses.replace(history, means=torch.cat(steps))
+
+
+def flying(n_steps=2, **options):
+    """As :func:`turning`, its rows with the velocity that brought them to where they are."""
+    history = turning(n_steps, **options)
+    steps = history.means.unflatten(0, (n_steps, -1))
+    velocity = torch.cat([torch.zeros_like(steps[:1]), steps[1:] - steps[:-1]])
+    return dataclasses.replace(history, velocity=velocity.flatten(0, 1))
+
+
+def test_what_comes_next_follows_from_what_is_momentum():
+    history = flying()
+    moved, rigid, own = velocities(history).unbind(1)
+    n = history.clouds.count(1)
+    assert_same_bits(own, history.velocity[-n:])
+    assert_close_relative_to_max(rigid, turning(3).means[-n:] - history.means[-n:], 0.02)
+    assert_close_relative_to_max(moved.mean(0), torch.tensor(VELOCITY), 0.1)
+
+
+@pytest.mark.parametrize("squashed", [1.0, 0.2])
+def test_a_whole_body_may_tumble(squashed):
+    """Whatever its shape: ways of half a radian are chords, which an inertia of one end of them would misread."""
+    spin, size = (0.3, 0.0, -0.4), torch.tensor([1.0, 1.0, squashed])
+    turn = torch.linalg.matrix_exp(cross_matrix(spin))
+    now = (turning(1).means - 1 - 0.2) * size
+    places, way = 1 + now, torch.tensor(VELOCITY) + now - now @ turn
+    history = dataclasses.replace(turning(1), means=places, velocity=way)
+    moved, rigid, _ = velocities(history, radius=2.0).unbind(1)
+    arms = now - now.mean(0)
+    assert_close_relative_to_max(moved, way.mean(0).expand_as(moved), 0.02)
+    assert_close_relative_to_max(rigid, way.mean(0) + arms @ turn.T - arms, 0.02)
+
+
+def test_untrained_a_body_flies_and_turns_on_and_knows_how():
+    dynamics = make_dynamics(dataclasses.replace(CARRYING, zero_init=True))
+    steps = rollout(dynamics, flying(), 6, max_steps=2)
+    assert_close_relative_to_max(steps[-1].means - 1, turning(8).means[1400:] - 1, 0.03)
+    assert_same_bits(steps[-1].velocity, steps[-1].means - steps[-2].means)
+
+
+def test_velocity_is_last_displacement():
+    dynamics, history = make_dynamics(CARRYING), with_attribute(make_history((60, 60)), "velocity")
+    step = dynamics(history)
+    assert_same_bits(step.velocity, step.means - last_steps(history, 1).means)
+    assert step.velocity[step.activity == DYNAMIC].any() and not step.velocity[step.activity == FROZEN].any()
+
+
+def test_what_carries_none_rests():
+    history = turning(2)
+    assert history.velocity is None and not velocities(history).any()
+
+
+def test_an_impulse_is_part_of_it_at_once():
+    """Whatever the history says."""
+    still = torch.tensor([0.0, 0.01, 0.0]).expand(200, 3)
+    history = flying()
+    history = dataclasses.replace(history, velocity=torch.cat([history.velocity[:200], still]))
+    moved, rigid, own = velocities(history).unbind(1)
+    assert_same_bits(own, still)
+    assert_close_relative_to_max(moved, still, 1e-3)
+    assert_close_relative_to_max(rigid, still, 1e-3)
+
+
+def test_what_holds_some_rows_turns_the_body():
+    """Friction: rows below stop, those above go on; the body falls forward about them."""
+    before = turning(1)
+    low = before.means[:, 2] < 0.85
+    assert 10 < low.sum() < 60
+    step = torch.where(low[:, None], 0.0, torch.tensor([0.04, 0.0, 0.0]))
+    rigid = velocities(dataclasses.replace(before, velocity=step))[:, 1]
+    assert rigid[before.means[:, 2] > 1.15, 0].mean() > 0.038 and rigid[low, 0].mean() < 0.03
+    assert_close_relative_to_max(rigid.mean(0), step.mean(0), 0.2)
+
+
+def test_a_place_that_is_none_spoils_nothing():
+    """Neither what others are told nor a gradient."""
+    history = flying()
+    means = history.means.clone()
+    means[250] = torch.nan
+    broken = dataclasses.replace(history, means=means, velocity=history.velocity.clone().requires_grad_())
+    rigid = velocities(broken)[:, 1]
+    others = torch.arange(200) != 50
+    assert rigid.isfinite().all()
+    assert_close_relative_to_max(rigid[others], velocities(history)[others, 1], 0.02)
+    rigid.sum().backward()
+    assert broken.velocity.grad.isfinite().all()
+
+
+def test_compiled_it_is_the_same(device):
+    history = flying().to(device)
+    history.clouds
+    priors, compiled = build(history, InertiaConfig(radius=LENGTH)), torch.compile(velocities, fullgraph=True)
+    assert_close_relative_to_max(compiled(history, priors=priors), velocities(history), 1e-4)
+
+
+TURNING = with_priors(TINY, InertiaConfig(radius=LENGTH, rotate_appearance=True), zero_init=True)
+
+
+def test_what_is_drawn_turns_with_the_body_and_what_is_frozen_does_not():
+    """Also on from where an edit turned it to."""
+    history = flying()
+    frozen = torch.arange(400) % 200 < 5
+    history = dataclasses.replace(history, activity=torch.where(frozen, FROZEN, history.activity).to(torch.uint8))
+    steps = rollout(make_dynamics(TURNING), history, 6, max_steps=2)
+    expected = torch.linalg.matrix_exp(6 * cross_matrix(SPIN))
+    found = rotation_matrices(steps[-1].orientations)
+    assert_close_relative_to_max(found[5:], expected.expand(195, 3, 3), 0.02)
+    assert_same_bits(steps[-1].orientations[:5], torch.tensor([1.0, 0, 0, 0]).expand(5, 4))
+    edited = Rotate(axis=(1.0, 0.0, 0.0), degrees=90.0).apply(history, None)
+    again = rollout(make_dynamics(TURNING), edited, 1, max_steps=2)[0].orientations
+    about_x = torch.linalg.matrix_exp(cross_matrix((torch.pi / 2, 0.0, 0.0)))
+    one = about_x @ torch.linalg.matrix_exp(cross_matrix(SPIN)) @ about_x.T @ about_x
+    assert_close_relative_to_max(rotation_matrices(again)[5:], one.expand(195, 3, 3), 0.02)
+
+
+def test_without_turning_nothing_turns():
+    assert make_dynamics(CARRYING)(flying()).orientations is None
+
+
+def test_where_there_is_nothing_nothing_turns():
+    """Nor where a place is none."""
+    history = flying()
+    nobody = history.select_rows(torch.zeros(history.n_rows, dtype=torch.bool))
+    assert make_dynamics(TURNING)(nobody).orientations.shape == (0, 4)
+    means = history.means.clone()
+    means[250] = torch.nan
+    found = make_dynamics(TURNING)(dataclasses.replace(history, means=means)).orientations
+    assert_same_bits(found[50], torch.tensor([1.0, 0, 0, 0]))
+    others = torch.arange(200) != 50
+    assert_close_relative_to_max(found[others], make_dynamics(TURNING)(history).orientations[others], 0.02)
+
+
+def test_scenes_turn_each_for_itself():
+    one, other = flying(), flying(n=150, seed=3, spin=(0.1, 0.0, 0.0))
+    both = make_dynamics(TURNING)(batch([one, other])).orientations
+    alone = torch.cat([make_dynamics(TURNING)(q).orientations for q in (one, other)])
+    assert_close_relative_to_max(both, alone, 1e-5)
+
+
+def test_a_gpu_turns_the_same(devices):
+    history = flying()
+    expected, actual, again = (
+        make_dynamics(TURNING).to(d)(history.to(d)).orientations.cpu() for d in (*devices, devices[1])
+    )
+    assert_close_relative_to_max(actual, expected, 1e-4)
+    assert_same_bits(again, actual)
+
+
+def test_compiled_it_turns_the_same(device):
+    history = flying().to(device)
+    last = last_steps(history, 1)
+    last.clouds
+    turns, moved = torch.tensor([1.0, 0, 0, 0], device=device).expand(200, 4), history.velocity[200:]
+
+    def found(turns, moved, last):
+        return rotate_with_window(windows(last, LENGTH, TINY.grid_size), turns, moved)
+
+    expected = found(turns, moved, last)
+    assert_close_relative_to_max(torch.compile(found, fullgraph=True)(turns, moved, last), expected, 1e-5)
+
+
+@pytest.mark.parametrize("change", [{"explicit": True}, {"steps_per_call": 2}])
+def test_rotated_appearance_needs_latent_model_and_one_step_a_call(change):
+    with pytest.raises(ValueError, match="prior inertia needs"):
+        dataclasses.replace(TURNING, **change)

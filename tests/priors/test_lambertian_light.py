@@ -1,0 +1,263 @@
+"""How much light reaches the surfaces that particles make, and a dynamics that lights them."""
+
+import dataclasses
+from functools import partial
+
+import pytest
+import torch
+from torch.nn import functional as F
+
+from gsim3d.dynamics import last_steps, rollout
+from gsim3d.priors.lighting import SOFT, lambert
+from gsim3d.priors.movable import Movable
+from gsim3d.state import ASLEEP, DYNAMIC, FROZEN
+from tests.asserts import assert_close_relative_to_max, assert_same_bits
+from tests.dynamics.scenes import TINY, batch, make_dynamics, make_history, permute_rows
+from tests.priors.scenes import with_priors
+from tests.priors.test_occlusion_light import CELL, HEIGHT, LAMBERT, RADIUS, light_of, under_a_ball
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+SLANTED = torch.tensor([[0.36, 0.24, 0.9]])
+TOWARDS = SLANTED[0] / SLANTED[0].norm()
+LIT = with_priors(TINY, LAMBERT, grid_size=CELL)
+
+
+def daylight(history, lights, cell, facing=None):
+    """[N, L] twice, the irradiance and the cosine of the newest particles."""
+    return lambert(Movable(history, cell), lights, cell, LAMBERT, facing)
+
+
+def opaque(history):
+    return dataclasses.replace(history, opacities=torch.full_like(history.opacities, 0.8))
+
+
+def scene(n=2000, **options):
+    """A ball over a ground, of opaque rows."""
+    return opaque(under_a_ball(n, **options))
+
+
+def parts(history, values):
+    """Places of the ground's rows from below the ball's middle, and of the ball's from there; and their values."""
+    newest = last_steps(history, 1)
+    moves, places = newest.activity == DYNAMIC, newest.means - 1.0
+    return (places[~moves], values[~moves]), (places[moves] - torch.tensor([0.0, 0.0, HEIGHT]), values[moves])
+
+
+def softened(cosine):
+    return ((cosine + SOFT) / (1 + SOFT)).clamp(min=0)
+
+
+@pytest.mark.parametrize("n", [600, 2000])
+def test_a_ball_is_lit_by_the_angle_between_its_surface_and_the_light(n):
+    history = scene(n)
+    lit, facing = daylight(history, SLANTED, CELL)
+    _, (places, of_ball) = parts(history, torch.cat([lit, facing], 1))
+    expected = softened(F.normalize(places, dim=1) @ TOWARDS)
+    assert (of_ball[:, 1] - expected).abs().mean() < 0.03
+    front = expected > 0.2
+    assert (of_ball[front, 0] / of_ball[front, 1]).min() > 0.8  # its own rows do not stand in the way
+
+
+@pytest.mark.parametrize("light", [(0.0, 0.0, 1.0), (0.0, 0.0, 0.02), (0.6, 0.0, 0.8), (-0.3, 0.5, 0.8)])
+def test_a_shadow_falls_on_the_ground_where_the_light_does_not(light):
+    light, history = torch.tensor([light]), scene()
+    towards = light[0] / light.norm()
+    lit, facing = daylight(history, light, CELL)
+    (places, of_ground), _ = parts(history, torch.cat([lit, facing], 1))
+    off = torch.linalg.cross(torch.tensor([0.0, 0.0, HEIGHT]) - places, towards.expand_as(places)).norm(dim=1)
+    share = of_ground[:, 0] / of_ground[:, 1]
+    assert_close_relative_to_max(of_ground[:, 1], softened(towards[2]).expand(len(places)), 0.01)
+    assert share[off < RADIUS].max() < 0.1 and share[off > RADIUS + 0.1].min() > 0.95
+
+
+def test_a_sheet_shows_the_light_its_front():
+    ticks = torch.arange(30) * 0.03
+    x, y = (v.flatten() for v in torch.meshgrid(ticks, ticks, indexing="ij"))
+    history = opaque(make_history((len(x),), frozen_share=0.0))
+    history = dataclasses.replace(history, means=torch.stack([1 + x, 1 + y, 1 + 0 * x], 1))
+    lit, facing = daylight(history, SLANTED, CELL)
+    assert_close_relative_to_max(facing[:, 0], softened(TOWARDS[2]).expand(len(x)), 0.01)
+    assert (lit / facing).min() > 0.9
+
+
+def test_many_rows_stand_in_the_light_as_few_do():
+    few, many = (parts(h, daylight(h, SLANTED, CELL)[0])[0][1] for h in (scene(700), scene(4000)))
+    assert (few - many).abs().mean() < 0.02 and few.min() < 0.3
+
+
+def test_what_rests_or_is_transparent_casts_no_shadow():
+    over = scene()
+    for activity, opacity in ((FROZEN, 0.8), (ASLEEP, 0.8), (DYNAMIC, 0.1)):
+        moves = over.activity == DYNAMIC
+        changed = dataclasses.replace(
+            over,
+            activity=torch.where(moves, activity, over.activity).to(torch.uint8),
+            opacities=torch.where(moves, opacity, over.opacities),
+        )
+        lit, facing = daylight(changed, SLANTED, CELL)
+        assert_same_bits(lit, facing)
+
+
+def test_what_is_known_of_rows_that_rest_is_kept():
+    history = scene()
+    lit, facing = daylight(history, SLANTED, CELL)
+    again = daylight(history, SLANTED, CELL, facing=facing)
+    assert_same_bits(again[0], lit)
+    moves = last_steps(history, 1).activity == DYNAMIC
+    half = daylight(history, SLANTED, CELL, facing=0.5 * facing)
+    assert_close_relative_to_max(half[0][~moves], 0.5 * lit[~moves], 1e-6)
+    assert_same_bits(half[0][moves], lit[moves])
+
+
+def test_turning_the_light_changes_it_as_its_gradient_says():
+    history = scene(300)
+    history = dataclasses.replace(history, means=history.means.double())
+    light = torch.tensor([[0.2, 0.1, 0.5]], dtype=torch.float64, requires_grad=True)
+    weights = torch.rand(last_steps(history, 1).n_rows, 1, dtype=torch.float64)
+    _, known = daylight(history, light.detach(), CELL)
+
+    def total(x):
+        """Of the ground: where rays of the ball begin is no function of the light to the gradient."""
+        lit = daylight(history, x, CELL, facing=known)[0]
+        return (lit * weights)[last_steps(history, 1).activity == FROZEN].sum()
+
+    (gradient,) = torch.autograd.grad(total(light), [light])
+    for axis in range(3):
+        step = torch.zeros(1, 3, dtype=torch.float64)
+        step[0, axis] = 1e-6
+        difference = (total(light.detach() + step) - total(light.detach() - step)) / 2e-6
+        assert abs(float(difference - gradient[0, axis])) < 1e-3 * float(gradient.abs().max())
+
+
+def test_scenes_do_not_see_each_other_and_rows_have_no_order():
+    one, other = scene(200), opaque(make_history((7, 50), seed=1))
+    both = torch.cat(daylight(batch([one, other]), SLANTED, CELL), 1)
+    alone = torch.cat([torch.cat(daylight(q, SLANTED, CELL), 1) for q in (one, other)])
+    assert_close_relative_to_max(both, alone, 2e-3)  # the normals of a few rows without order depend on rounding
+    shuffled, order = permute_rows(one)
+    newest = order[one.cu_rows[-2] :] - one.cu_rows[-2]
+    assert_close_relative_to_max(daylight(shuffled, SLANTED, CELL)[0], daylight(one, SLANTED, CELL)[0][newest], 2e-3)
+
+
+@pytest.mark.parametrize("n_rows", [(0, 50), (1, 1)])
+def test_where_nothing_moves_nothing_is_in_the_way(n_rows):
+    lit, facing = daylight(opaque(make_history(n_rows, frozen_share=1.0)), SLANTED, CELL)
+    assert lit.shape == facing.shape == (n_rows[-1], 1)
+    assert_same_bits(lit, facing)
+
+
+def test_no_number_it_cannot_use_gets_out():
+    history = scene()
+    means = history.means.clone()
+    means[-1], means[-5], means[-2200] = torch.nan, torch.inf, torch.nan
+    for found in daylight(dataclasses.replace(history, means=means), SLANTED, CELL):
+        assert found.isfinite().all() and found.any()
+
+
+def test_a_row_without_neighbours_has_a_light():
+    """Far from all others, where a window holds one row or none."""
+    history = scene()
+    means = history.means.clone()
+    means[-3:] += torch.tensor([[5.0, 0.0, 0.0], [0.0, 7.0, 0.0], [0.0, 0.0, 9.0]])
+    lit, facing = daylight(dataclasses.replace(history, means=means), SLANTED, CELL)
+    assert (lit >= 0).all() and (facing <= 1).all() and facing.isfinite().all()
+
+
+def test_a_gpu_finds_the_same(devices):
+    history = batch([scene(600), opaque(make_history((30, 40)))])
+    expected, actual = (torch.cat(daylight(history.to(d), SLANTED.to(d), CELL), 1).cpu() for d in devices)
+    assert (actual - expected).abs().mean() < 1e-3
+    assert_same_bits(torch.cat(daylight(history.to(devices[1]), SLANTED.to(devices[1]), CELL), 1).cpu(), actual)
+
+
+def test_compiled_it_is_the_same(device):
+    history, lights = scene(50).to(device), SLANTED.to(device)
+    history.clouds
+    compiled = torch.compile(daylight, fullgraph=True)
+    for actual, expected in zip(compiled(history, lights, CELL), daylight(history, lights, CELL)):
+        assert_close_relative_to_max(actual, expected, 1e-3)
+
+
+@pytest.mark.parametrize("background", ["symmetric", "relightable"])
+def test_colours_follow_the_light(background):
+    """That of where rows are over that of where they were encoded, times what is predicted."""
+    dynamics, history = make_dynamics(dataclasses.replace(LIT, zero_init=True, background=background)), scene(600)
+    strength = torch.tensor([[0.8, 1.0, 1.2], [0.1, 0.0, 0.3]])
+    light_of(dynamics).strength.data = strength
+    known = dynamics.initialize(history)
+    newest = last_steps(known, 1)
+    lit, facing, now = newest.light_occlusion.split(2, 1)
+    assert_same_bits(lit, now)
+    found = daylight(history, light_of(dynamics).directions, CELL)
+    assert_close_relative_to_max(lit, found[0], 1e-6)
+    assert_close_relative_to_max(facing, found[1], 1e-6)
+    assert (known.light_occlusion[: -newest.n_rows] == -1).all()
+    assert (dynamics(known).irradiance_gain - 1).abs().max() < 1e-5  # nothing moved
+    moves = newest.activity == DYNAMIC
+    aside = torch.where((known.activity == DYNAMIC)[:, None], torch.tensor([0.3, 0.0, 0.0]), 0)
+    moved = dataclasses.replace(known, means=known.means + aside)
+    step = dynamics(moved)
+    then, now = (
+        (1 + values @ strength)
+        for values in (lit, daylight(moved, light_of(dynamics).directions, CELL, facing=facing)[0])
+    )
+    assert_close_relative_to_max(step.irradiance_gain, now / then, 1e-4)
+    assert step.irradiance_gain[~moves].min() < 0.6 and step.irradiance_gain[~moves].max() > 1.5
+    assert_same_bits(step.light_occlusion[:, :4], newest.light_occlusion[:, :4])
+    light_of(dynamics).gain_head.bias.detach()[:] = torch.tensor([0.1, 0.0, -0.4])
+    more = (2 * (torch.tensor([0.1, 0.0, -0.4]) / 2).tanh()).exp()
+    assert_close_relative_to_max(dynamics(moved).irradiance_gain, step.irradiance_gain * more, 1e-4)
+
+
+def test_the_light_reaches_all_whoever_may_change_but_not_rows_that_are_held():
+    dynamics, history = make_dynamics(LIT), scene(300)
+    torch.nn.init.normal_(light_of(dynamics).gain_head.weight, std=0.1)
+    known = dynamics.initialize(history)
+    aside = torch.where((known.activity == DYNAMIC)[:, None], torch.tensor([0.3, 0.0, 0.0]), 0)
+    held = torch.arange(known.n_rows) % 3 == 0
+    known = dataclasses.replace(known, means=known.means + aside, frozen_appearance=held)
+    moves = last_steps(known, 1).activity == DYNAMIC
+    light = {}
+    for who in ("all", "dynamic", "frozen", "none"):
+        *_, last = rollout(partial(dynamics, changes=dynamics.layout.changes(who)), known, 2, 2)
+        assert (last.irradiance_gain[last.frozen_appearance] == 1).all() and (
+            last.irradiance_gain[~last.frozen_appearance] != 1
+        ).any()
+        light[who] = last.irradiance_gain
+    assert_close_relative_to_max(light["frozen"][~moves], light["all"][~moves], 0.2)
+    assert (light["none"][~moves] - light["all"][~moves]).abs().max() > 1e-4  # what is predicted is not of all
+    assert (light["none"][~moves] - light["dynamic"][~moves]).abs().max() < 0.2
+
+
+def test_the_network_reads_it_and_training_reaches_strength_and_direction():
+    dynamics, history = make_dynamics(LIT), scene(100)
+    torch.nn.init.normal_(light_of(dynamics).gain_head.weight)
+    known = dynamics.initialize(history)
+    aside = torch.where((known.activity == DYNAMIC)[:, None], torch.tensor([0.1, 0.0, 0.0]), 0)
+    step = dynamics(dataclasses.replace(known, means=known.means + aside))
+    step.irradiance_gain.square().sum().backward()
+    assert (
+        light_of(dynamics).directions.grad.abs().amax(1).gt(0).all()
+        and light_of(dynamics).strength.grad.abs().gt(0).all()
+    )
+    assert light_of(dynamics).in_proj.weight.grad.abs().amax(0).gt(0).all()
+
+
+def test_a_step_of_training_turns_a_lamp_by_little():
+    dynamics = make_dynamics(LIT)
+    before, rate = F.normalize(light_of(dynamics).directions.detach(), dim=1), 1e-3
+    light_of(dynamics).directions.grad = torch.tensor([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    torch.optim.AdamW([light_of(dynamics).directions], lr=rate).step()
+    turned = (F.normalize(light_of(dynamics).directions.detach(), dim=1) - before).norm(dim=1)
+    assert turned.gt(0).all() and turned.max() < 0.1 * rate
+
+
+def test_rows_that_were_not_encoded_are_lit_as_where_they_begin():
+    dynamics, history = make_dynamics(dataclasses.replace(LIT, zero_init=True)), scene(300)
+    step = dynamics(history)
+    assert (step.irradiance_gain - 1).abs().max() < 1e-5
+    assert_close_relative_to_max(
+        step.light_occlusion[:, :2], daylight(history, light_of(dynamics).directions, CELL)[0], 0.3
+    )
+    assert (step.light_occlusion >= 0).all()
