@@ -306,7 +306,7 @@ def test_the_next_run_has_the_capacity_that_graphs_needed(store, tmp_path):
             load_into(second, tmp_path / "state", NAME)
 
 
-@pytest.mark.parametrize("arm", ["pure", "positions", "motion", "priors"])
+@pytest.mark.parametrize("arm", ["pure", "positions", "priors"])
 @pytest.mark.parametrize("world", WORLDS)
 def test_recipes_are_sound(world, arm):
     made = recipe(world, arm)
