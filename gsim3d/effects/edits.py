@@ -23,6 +23,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from gsim3d.effects.selection import Selection, Vector, newest_mask
+from gsim3d.effects.spec import StructureEffects
 from gsim3d.errors import InputError
 from gsim3d.io.files import read_yaml, shown, typed
 from gsim3d.math.rotations import quat_product, rotate_left, rotation_matrices
@@ -284,6 +285,12 @@ def by_step(edits: Iterable[Edit], n_steps: int, *, insert: bool, remove: bool) 
                 raise InputError(f"{edit.where}: the plan has structure.{name} off")
         found.setdefault(edit.step, []).append(edit)
     return found
+
+
+def structure_of(edits: Iterable[Edit]) -> StructureEffects:
+    """The structure of a spec that allows ``edits``."""
+    operations = [edit.operation for edit in edits]
+    return StructureEffects(any(o.inserts for o in operations), any(o.removes for o in operations))
 
 
 def load_edits(path: str | Path, encode: Callable[[Path], Particles]) -> list[Edit]:

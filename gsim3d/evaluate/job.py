@@ -11,7 +11,7 @@ from gsim3d.errors import InputError
 from gsim3d.evaluate import compare
 from gsim3d.evaluate.pictures import write_curves
 from gsim3d.evaluate.predictions import Predictions
-from gsim3d.evaluate.protocol import default_views, horizon, score_scenes
+from gsim3d.evaluate.protocol import check_cameras, default_views, horizon, score_scenes
 from gsim3d.evaluate.report import summarize, table, write_csv, write_json, write_markdown
 from gsim3d.evaluate.scoring import SceneScores, measurable
 from gsim3d.io.files import output_path, with_parents
@@ -171,8 +171,7 @@ def _views(
             context, targets = default_views(restored, scene, job.context, job.cameras)
         elif not targets:
             targets = others[0].cameras(scenes[0])
-        if bad := [cam for cam in (*targets, *(context or ())) if not 0 <= cam < scene.n_cams]:
-            raise InputError(f"{scene.path}: camera {bad[0]} does not exist; the scene has {scene.n_cams}")
+        check_cameras(scene, (*targets, *(context or ())))
         views.append((context, targets))
         n_future = min(horizon(scene, n_encoded, job.steps), n_future or scene.n_steps)
     return views, n_future

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import os
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,12 +16,15 @@ from torch import Tensor
 from gsim3d.cameras import Cameras
 from gsim3d.data import Scene
 from gsim3d.errors import InputError
-from gsim3d.evaluate.protocol import Prediction
+from gsim3d.evaluate.protocol import Prediction, render_steps
 from gsim3d.evaluate.scoring import METRICS
-from gsim3d.io import write_ply
+from gsim3d.io import write_ply, write_video
+from gsim3d.io.files import write_picture
 from gsim3d.io.sequence import write_about
+from gsim3d.io.terminal import progress
 from gsim3d.nn.gaussian_head import render
 from gsim3d.train.restore import Restored
+from gsim3d.viewer.player import View, write_player
 
 FRAME_SIZE = 256  # pixels; smaller frames are enlarged by a whole factor to at most this height
 GAP = 4  # pixels of white between frames
@@ -78,6 +83,55 @@ def write_gaussians(folder: str | Path, restored: Restored, prediction: Predicti
     for step in range(prediction.n_steps):
         write_ply(folder / f"step_{step:04d}.ply", gaussians, step)
     write_about(folder, fps)
+
+
+def write_prediction(
+    folder: str | Path,
+    restored: Restored,
+    scene: Scene,
+    prediction: Prediction,
+    cams: Sequence[int],
+    first: int = 0,
+    *,
+    player: bool = False,
+    quiet: bool = True,
+) -> None:
+    """Writes a prediction as images, video and Gaussians into ``folder``, which appears whole or not at all.
+
+    Args:
+        cams: cameras to show.
+        first: step of the scene that the prediction begins with.
+        player: also write player.html.
+        quiet: no progress bar.
+    """
+    folder = Path(folder)
+    steps = [prediction.particles.select_clouds([step]) for step in range(prediction.n_steps)]
+    steps = progress(steps, "drawing", unit="step", quiet=quiet)
+    images = [as_bytes(render_steps(restored, step, scene, cams, first + i))[0] for i, step in enumerate(steps)]
+    truth = true_images(scene, cams, range(first, first + len(images)))
+    part = folder.with_name(f".{folder.name}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    try:
+        (part / "frames").mkdir(parents=True)
+        for step, views in enumerate(images):
+            for cam, image in zip(cams, views, strict=True):
+                write_picture(part / "frames" / f"cam_{cam}_{step:04d}.png", image)
+        write_video(part / "rollout.mp4", comparison_frames(truth, np.stack(images)), scene.fps)
+        write_gaussians(part / "gaussians", restored, prediction, scene.fps)
+        if player:
+            camera = scene.cameras_at(cams[:1], [first])
+            write_player(
+                part / "player.html",
+                restored.simulator.renderer(prediction.particles).to("cpu"),
+                fps=scene.fps,
+                title=scene.name,
+                view=View(camera.viewmats[0].numpy(), camera.Ks[0].numpy(), camera.width, camera.height),
+                truth=truth[:, 0],
+                start=prediction.n_encoded,
+            )
+        os.replace(part, folder)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
 
 
 @torch.no_grad()

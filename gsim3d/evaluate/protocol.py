@@ -20,6 +20,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -140,6 +141,18 @@ def predict(
             cannot be made.
     """
     return predict_together(restored, [scene], n_future, [context_cams], start=start, edits=edits)[0]
+
+
+def check_cameras(scene: Scene, cams: Sequence[int]) -> None:
+    """Raises InputError where the scene does not have one of ``cams``."""
+    if bad := [cam for cam in cams if not 0 <= cam < scene.n_cams]:
+        raise InputError(f"{scene.path}: camera {bad[0]} does not exist; the scene has {scene.n_cams}")
+
+
+def encode_folder(restored: Restored, folder: str | Path, resample: bool = False) -> Particles:
+    """The first ``history`` steps of the scene in ``folder``, seen by its default views."""
+    scene = restored.open_scene(folder, resample=resample)
+    return encode_steps(restored, scene, default_views(restored, scene)[0])
 
 
 @torch.no_grad()
