@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 
@@ -48,7 +48,7 @@ def constant(values: tuple[int, ...], device: torch.device) -> Tensor:
 
 
 @contextlib.contextmanager
-def keeping_constants(store: dict[tuple, Tensor]):
+def keeping_constants(store: dict[tuple, Tensor]) -> Iterator[None]:
     """Keeps in ``store`` every constant that is asked for: a captured graph reads them at each replay."""
     _stores.append(store)
     try:
@@ -78,7 +78,9 @@ class CloudTable:
         return cls(tuple(values[:n]), tuple(values[n:m]), tuple(values[m:]), tensors)
 
     @classmethod
-    def make(cls, counts: Iterable[int], scenes: Iterable[int], steps: Iterable[int], device) -> CloudTable:
+    def make(
+        cls, counts: Iterable[int], scenes: Iterable[int], steps: Iterable[int], device: torch.device
+    ) -> CloudTable:
         """``counts``: rows of each cloud."""
         numbers = tuple(accumulate(counts, initial=0)), tuple(scenes), tuple(steps)
         return cls(*numbers, tuple(constant(values, device) for values in numbers))
@@ -272,7 +274,9 @@ class Particles(TensorRecord):
         """The clouds as the host knows them. Only the first look at clouds given as tensors waits for the device."""
         tensors = (self.cu_rows, self.cloud_scene, self.cloud_step)
         if self.known is None or any(a is not b for a, b in zip(self.known.tensors, tensors)):
-            object.__setattr__(self, "known", CloudTable.read(*tensors))
+            table = CloudTable.read(*tensors)
+            object.__setattr__(self, "known", table)
+            return table
         return self.known
 
     def with_clouds(self, table: CloudTable, **fields: Tensor) -> Particles:

@@ -44,7 +44,7 @@ class Operation:
         of: which particles, a Selection or its ``which``.
     """
 
-    of: Selection = Selection()
+    of: Selection | str = Selection()
 
     name: ClassVar[str] = ""
     inserts: ClassVar[bool] = False

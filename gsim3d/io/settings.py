@@ -96,8 +96,8 @@ def upgraded(cls: type, content: Any) -> Any:
 
 def _old_name(cls: type, name: str) -> str:
     """A hint for a setting of earlier versions."""
-    if name in getattr(cls, "RENAMED", {}):
-        return f"; it is now called {cls.RENAMED[name]!r}"
+    if name in (renamed := getattr(cls, "RENAMED", {})):
+        return f"; it is now called {renamed[name]!r}"
     return "; this version no longer has it" if name in getattr(cls, "REMOVED", {}) else ""
 
 

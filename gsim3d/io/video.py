@@ -37,7 +37,7 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> N
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         with whole_file(path) as part:
-            codec = cv2.VideoWriter_fourcc(*"vp09")
+            codec = cv2.VideoWriter.fourcc(*"vp09")
             writer = cv2.VideoWriter(opencv_path(part), codec, float(fps), (shape[1], shape[0]))
             if not writer.isOpened():
                 raise InputError(f"{path}: this OpenCV cannot write VP9 here (folder missing or codec not built in)")
