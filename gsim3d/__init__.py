@@ -63,15 +63,53 @@ _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 __all__ = ["__version__", *_MODULE_OF]
 
 if TYPE_CHECKING:  # the same names for type checkers; tests/test_types.py compares them
-    from gsim3d.cameras import (Cameras as Cameras, FrameSource as FrameSource, Frames as Frames, InputSpec as InputSpec)
-    from gsim3d.effects.spec import (EffectsSpec as EffectsSpec, UnsupportedEffect as UnsupportedEffect)
-    from gsim3d.errors import (GradientError as GradientError, InputError as InputError, NumericalError as NumericalError, ProcessorError as ProcessorError)
-    from gsim3d.numerics.report import (StabilityReport as StabilityReport)
-    from gsim3d.ops import (CURVES as CURVES, KernelMap as KernelMap, PatchTable as PatchTable, Pyramid as Pyramid, PyramidCapacity as PyramidCapacity, PyramidSpec as PyramidSpec, Rendering as Rendering, Segments as Segments, Stage as Stage, Voxels as Voxels, add_cells as add_cells, build_pyramid as build_pyramid, cuda_compiled as cuda_compiled, curve_encode as curve_encode, curve_sort as curve_sort, decode_gaussians as decode_gaussians, find_cells as find_cells, joint_attention as joint_attention, norm_gelu as norm_gelu, overlapping_patches as overlapping_patches, patch_attention as patch_attention, plane_sweep as plane_sweep, pool_max as pool_max, pool_mean as pool_mean, rasterize_gaussians as rasterize_gaussians, residual_norm as residual_norm, row_norm as row_norm, row_scenes as row_scenes, sparse_conv as sparse_conv, sweep_geometry as sweep_geometry, unpool as unpool, validate_state as validate_state)
-    from gsim3d.presets import (ModelConfig as ModelConfig)
-    from gsim3d.profile.autotune import (autotune as autotune)
-    from gsim3d.simulator import (Prediction as Prediction, Simulator as Simulator)
-    from gsim3d.state import (Gaussians as Gaussians, Particles as Particles)
+    from gsim3d.cameras import Cameras as Cameras, Frames as Frames, FrameSource as FrameSource, InputSpec as InputSpec
+    from gsim3d.effects.spec import EffectsSpec as EffectsSpec, UnsupportedEffect as UnsupportedEffect
+    from gsim3d.errors import (
+        GradientError as GradientError,
+        InputError as InputError,
+        NumericalError as NumericalError,
+        ProcessorError as ProcessorError,
+    )
+    from gsim3d.numerics.report import StabilityReport as StabilityReport
+    from gsim3d.ops import (
+        CURVES as CURVES,
+        KernelMap as KernelMap,
+        PatchTable as PatchTable,
+        Pyramid as Pyramid,
+        PyramidCapacity as PyramidCapacity,
+        PyramidSpec as PyramidSpec,
+        Rendering as Rendering,
+        Segments as Segments,
+        Stage as Stage,
+        Voxels as Voxels,
+        add_cells as add_cells,
+        build_pyramid as build_pyramid,
+        cuda_compiled as cuda_compiled,
+        curve_encode as curve_encode,
+        curve_sort as curve_sort,
+        decode_gaussians as decode_gaussians,
+        find_cells as find_cells,
+        joint_attention as joint_attention,
+        norm_gelu as norm_gelu,
+        overlapping_patches as overlapping_patches,
+        patch_attention as patch_attention,
+        plane_sweep as plane_sweep,
+        pool_max as pool_max,
+        pool_mean as pool_mean,
+        rasterize_gaussians as rasterize_gaussians,
+        residual_norm as residual_norm,
+        row_norm as row_norm,
+        row_scenes as row_scenes,
+        sparse_conv as sparse_conv,
+        sweep_geometry as sweep_geometry,
+        unpool as unpool,
+        validate_state as validate_state,
+    )
+    from gsim3d.presets import ModelConfig as ModelConfig
+    from gsim3d.profile.autotune import autotune as autotune
+    from gsim3d.simulator import Prediction as Prediction, Simulator as Simulator
+    from gsim3d.state import Gaussians as Gaussians, Particles as Particles
 
 
 def __getattr__(name: str) -> Any:

@@ -71,7 +71,7 @@ class Remove(Operation):
     name: ClassVar[str] = "remove"
     removes: ClassVar[bool] = True
 
-    def apply(self, state, colors):
+    def apply(self, state: Particles, colors: Colors) -> Particles:
         return state.select_rows(~self.of.mask(state))
 
 
@@ -86,7 +86,7 @@ class Move(Operation):
     by: Vector = (0.0, 0.0, 0.0)
     name: ClassVar[str] = "move"
 
-    def apply(self, state, colors):
+    def apply(self, state: Particles, colors: Colors) -> Particles:
         return _moved(state, self.of.mask(state), self.by)
 
 
@@ -110,7 +110,7 @@ class Rotate(Operation):
         if not math.hypot(*self.axis) > 0:
             raise InputError(f"axis must have a direction; got {list(self.axis)}")
 
-    def apply(self, state, colors):
+    def apply(self, state: Particles, colors: Colors) -> Particles:
         chosen, means = self.of.mask(state), state.means
         vector = F.normalize(torch.tensor(self.axis, dtype=torch.float64), dim=0) * math.radians(self.degrees)
         quat = rotate_left(torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64), vector[None])
@@ -138,7 +138,7 @@ class Throw(Operation):
     velocity: Vector = (0.0, 0.0, 0.0)
     name: ClassVar[str] = "throw"
 
-    def apply(self, state, colors):
+    def apply(self, state: Particles, colors: Colors) -> Particles:
         chosen, table = self.of.mask(state), state.clouds
         if bool((state.activity[chosen] == FROZEN).any()):
             raise InputError("frozen particles cannot be thrown; name others")
@@ -169,7 +169,7 @@ class Recolor(Operation):
         if not all(0 <= value <= 1 for value in self.color):
             raise InputError(f"color must be three numbers from 0 to 1; got {list(self.color)}")
 
-    def apply(self, state, colors):
+    def apply(self, state: Particles, colors: Colors) -> Particles:
         chosen = self.of.mask(state)
         newest = chosen & newest_mask(state)
         grey = state.means.new_tensor(GREY)
@@ -193,7 +193,7 @@ class Duplicate(Operation):
     name: ClassVar[str] = "duplicate"
     inserts: ClassVar[bool] = True
 
-    def apply(self, state, colors):
+    def apply(self, state: Particles, colors: Colors) -> Particles:
         chosen = self.of.mask(state)
         return _joined(state, _moved(state, chosen, self.by).select_rows(chosen))
 
@@ -212,7 +212,7 @@ class Insert(Operation):
     name: ClassVar[str] = "insert"
     inserts: ClassVar[bool] = True
 
-    def apply(self, state, colors):
+    def apply(self, state: Particles, colors: Colors) -> Particles:
         chosen, given = self.of.mask(self.particles), dataclasses.replace(self.particles, frozen_appearance=None)
         if len(newest_clouds(given.clouds)) != 1:
             raise InputError("particles must be of one scene")

@@ -50,7 +50,9 @@ class Terminal:
         return getattr(self._stream, name)
 
 
-def progress(iterable: Any = None, what: str = "", total: int | None = None, *, unit: str = "it", quiet: bool = False) -> Any:
+def progress(
+    iterable: Any = None, what: str = "", total: int | None = None, *, unit: str = "it", quiet: bool = False
+) -> Any:
     """A progress bar with the time left; hidden where stderr is no terminal."""
     from tqdm import tqdm
 

@@ -20,8 +20,7 @@ from gsim3d.io.checkpoint import Checkpoint
 from gsim3d.pretrained import names
 from gsim3d.train.config import DataConfig
 from gsim3d.train.restore import Restored, build_simulator
-from tests.data.made_videos import trimmed, write_plain
-from tests.data.made_videos import write_scene as write_videos
+from tests.data.made_videos import trimmed, write_plain, write_scene as write_videos
 from tests.tiny_scenes import write_scene
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -23,11 +23,9 @@ from gsim3d.ops import (
 )
 from gsim3d.testing.invariances import random_motion
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, gradients
-from tests.ops.raster_scene import Scene, random_scene
-from tests.ops.raster_scene import gradients as raster_gradients
+from tests.ops.raster_scene import Scene, gradients as raster_gradients, random_scene
 from tests.ops.test_patch_attn import random_case
-from tests.ops.test_pyramid import SPEC, flat, on
-from tests.ops.test_pyramid import scene as pyramid_scene
+from tests.ops.test_pyramid import SPEC, flat, on, scene as pyramid_scene
 from tests.ops.test_sparse_conv import geometry, parameters, random_cells
 
 pytestmark = pytest.mark.usefixtures("one_thread")

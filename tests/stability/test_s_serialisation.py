@@ -16,8 +16,7 @@ from tests.dynamics.scenes import TINY, batch, float_fields, make_history, permu
 from tests.ops.test_plane_sweep import make as make_sweep
 from tests.ops.test_pyramid import assert_matches_oracle
 from tests.ops.test_sparse_conv import geometry, parameters, random_cells
-from tests.oracle import curve as curve_oracle
-from tests.oracle import sparse_conv as conv_oracle
+from tests.oracle import curve as curve_oracle, sparse_conv as conv_oracle
 from tests.stability.rollouts import make_simulator, ordinary, raised
 from tests.stability.setting import NAMES
 from tests.stability.steps import check_same_rows, check_step, simulate

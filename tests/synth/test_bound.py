@@ -8,8 +8,7 @@ import pytest
 
 from gsim3d.cli.main import main
 from gsim3d.errors import InputError
-from gsim3d.synth import bound as module
-from gsim3d.synth import generate
+from gsim3d.synth import bound as module, generate
 from gsim3d.synth.bound import ERRORS, GIVEN, StartErrors, bound, read_given
 from gsim3d.synth.worlds import WORLDS, build_world
 

@@ -48,8 +48,7 @@ from gsim3d.train.log import LOG, Log
 from gsim3d.train.restore import restore
 from tests.compat.release import random_weights, settings_of, small_config, write_release
 from tests.data.made_scenes import WRITERS, edit_json, make_scene
-from tests.data.made_videos import trimmed, with_gaps, write_plain
-from tests.data.made_videos import write_scene as write_videos
+from tests.data.made_videos import trimmed, with_gaps, write_plain, write_scene as write_videos
 from tests.data.test_colmap import seen_points, write_colmap
 from tests.data.test_transforms import write_synthetic
 from tests.io.test_ply import DC, REST, SHAPE, XYZ, rows_of
