@@ -44,6 +44,7 @@ class RunTrainer(Trainer):
         super().__init__(config, store.trajectories[:1], out, device=device, processes=processes)
         self.first_step, self.begin, self.now, self.end, self.is_last = 0, 0.0, 0.0, math.inf, False
         self.gone: str | None = None
+        self.new_parameters: list[str] = []
         self._side = torch.cuda.Stream() if device == "cuda" else None
         self._next: tuple[int, Future] | None = None
         self._reader = ThreadPoolExecutor(1)

@@ -30,6 +30,7 @@ from gsim3d.train.restore import describe
 FORMAT = 2
 BLOCK = 64  # weights that share a scale
 LEVELS = 127
+PRIORS = "dynamics.priors."  # names of their parameters begin so
 CURVE = ("step", "windows", "seconds", "loss", "past_psnr", "future_psnr", "learning_rate")
 
 
@@ -82,6 +83,8 @@ def load_progress(folder: str | Path, name: str) -> Progress:
 def load_into(trainer: Trainer, folder: str | Path, name: str) -> Progress:
     """Weights, second moments and capacity of graphs of run ``name`` into a new trainer.
 
+    Parameters of priors that the state's model did not have stay as they are; ``trainer.new_parameters`` names them.
+
     Returns:
         The progress so far; of a new run, whose trainer stays as it is, where ``folder`` has no state.
     Raises:
@@ -95,8 +98,12 @@ def load_into(trainer: Trainer, folder: str | Path, name: str) -> Progress:
     try:
         if trainer.captured and progress.needed:
             trainer.captured.reserve(progress.needed)
-        weights = {key: _unpacked(tensors, key, value.shape) for key, value in own.items()}
-        trainer.simulator.load_state_dict(weights)
+        trainer.new_parameters = [key for key in own if key not in tensors and f"{key}.int8" not in tensors]
+        if other := [key for key in trainer.new_parameters if not key.startswith(PRIORS)]:
+            raise KeyError(f"it has no {other[0]}")
+        known = own.keys() - set(trainer.new_parameters)
+        weights = {key: _unpacked(tensors, key, own[key].shape) for key in known}
+        trainer.simulator.load_state_dict(weights, strict=False)
         trainer.average = {key: value.clone() for key, value in trainer.simulator.state_dict().items()}
         for key, parameter in trainer.parameters.items():
             if f"{key}.squares" in tensors or f"{key}.rows" in tensors:

@@ -61,6 +61,8 @@ def run(recipe, state: Path, out: Path, *, minutes: float, device: str, workers:
             progress = load_into(trainer, state, name)
             if not made.wait_for(-(-recipe.n_first // together.count), end - time.monotonic()):
                 raise InputError(f"--minutes: {minutes:g} pass before {recipe.n_first} trajectories are made")
+            if trainer.new_parameters:
+                report(f"{name}: begin at their first values: {', '.join(trainer.new_parameters)}")
             waited = round(time.monotonic() - begin, 1)
             report(f"{name}: {made.count} trajectories after {waited} s; from step {trainer.step}")
             machine = torch.cuda.get_device_name() if device == "cuda" else "cpu"
@@ -70,6 +72,7 @@ def run(recipe, state: Path, out: Path, *, minutes: float, device: str, workers:
                 "seconds_before": waited,
                 "seed": world.seed,
                 "is_last": is_last,
+                "new_parameters": trainer.new_parameters,
             }
             given = {"end": end, "out": out, "name": name, "is_last": is_last, "say": report}
             progress = train(trainer, made, progress, about, **given)
@@ -138,7 +141,7 @@ def say(text: str) -> None:
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0], allow_abbrev=False)
     parser.add_argument("world", choices=("elastic", "cloth", "rigid"))
-    parser.add_argument("--arm", default="pure", help="pure (default), positions, motion or priors")
+    parser.add_argument("--arm", default="pure", help="pure (default), positions or priors")
     parser.add_argument("--minutes", type=float, required=True, help="length of this run, everything included")
     parser.add_argument("--state", type=Path, required=True, help="folder with the state of the last run, if any")
     parser.add_argument("--out", type=Path, required=True, help="folder for the state and the video; may be the same")
