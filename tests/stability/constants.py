@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 _RASTER = "csrc/gsim3d/raster/raster_math.h"
-_STATE = "gsim3d/dynamics/state.py"
+_STATE = "gsim3d/dynamics/step.py"
 _CONFIG = "gsim3d/dynamics/config.py"
 _STABILITY = "gsim3d/numerics/policy.py"
 
@@ -96,7 +96,7 @@ CONSTANTS = (
         "HALF_MAX",
         "torch.finfo(torch.float16).max",
         "1",
-        "gsim3d/nn/point_transformer.py",
+        "gsim3d/compat/released_model.py",
         "65504: larger numbers become it where the release's half precision is imitated",
     ),
     Constant(
@@ -132,7 +132,13 @@ CONSTANTS = (
         "gsim3d/math/rotations.py",
         "a shorter quaternion is the identity, without a gradient",
     ),
-    Constant("SMALL_ANGLE_SQUARED", "1e-8", "radians^2", _STATE, "a smaller rotation is its series, exact to float32"),
+    Constant(
+        "SMALL_ANGLE_SQUARED",
+        "1e-8",
+        "radians^2",
+        "gsim3d/math/rotations.py",
+        "a smaller rotation is its series, exact to float32",
+    ),
     Constant("SCALE_STEP_SHARE", "1 / 6", "of the range of scales", _STATE, "the most that a step changes a scale"),
     Constant(
         "scale_min",
@@ -179,7 +185,7 @@ CONSTANTS = (
         "SMALLEST_SCALE",
         "1e-9",
         "metres",
-        "gsim3d/io/ply.py",
+        "gsim3d/io/arrays.py",
         "smaller scales are written as it: finite logarithms",
     ),
     Constant(
