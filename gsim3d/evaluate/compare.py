@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from numbers import Real
 from pathlib import Path
 
@@ -119,13 +119,18 @@ def _score(report: dict, scene: str, score: str) -> float | None:
     return float(value) if isinstance(value, Real) and math.isfinite(value) else None
 
 
+def paired(differences: Sequence[float]) -> tuple[float, float | None]:
+    """The mean of differences of pairs, and its standard error; None of a single pair."""
+    n = len(differences)
+    return statistics.fmean(differences), statistics.stdev(differences) / math.sqrt(n) if n > 1 else None
+
+
 def _difference(differences: list[float], rises: bool) -> dict:
-    mean, n = statistics.fmean(differences), len(differences)
-    error = statistics.stdev(differences) / math.sqrt(n) if n > 1 else None
+    mean, error = paired(differences)
     if error is None:
         verdict = "of one scene: no standard error"
     elif abs(mean) > LEAST * error:
         verdict = "better" if (mean > 0) == rises else "worse"
     else:
         verdict = "the same within two standard errors"
-    return {"difference": mean, "standard_error": error, "scenes": n, "verdict": verdict}
+    return {"difference": mean, "standard_error": error, "scenes": len(differences), "verdict": verdict}

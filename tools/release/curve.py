@@ -9,13 +9,13 @@ other one's, trajectory by trajectory, with their standard errors; nothing below
 """
 
 import argparse
-import math
 import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 sys.path.insert(0, str(ROOT))
 from gsim3d.errors import InputError  # noqa: E402
+from gsim3d.evaluate.compare import LEAST, paired  # noqa: E402
 from tools.release.state import CURVE, Progress, load_progress  # noqa: E402
 
 SCORES = ("past", "future", "body", "constant")
@@ -47,10 +47,8 @@ def difference(first: dict, second: dict) -> str:
         raise InputError("the two scores are of different trajectories")
     parts = []
     for index, score in enumerate(SCORES[:3]):
-        gaps = [second["scenes"][name][index] - first["scenes"][name][index] for name in first["scenes"]]
-        mean = sum(gaps) / len(gaps)
-        error = math.sqrt(sum((gap - mean) ** 2 for gap in gaps) / (len(gaps) - 1) / len(gaps))
-        where = "beyond" if abs(mean) > 2 * error else "within"
+        mean, error = paired([second["scenes"][name][index] - first["scenes"][name][index] for name in first["scenes"]])
+        where = "beyond" if abs(mean) > LEAST * error else "within"
         parts.append(f"{score} {mean:+.2f} ± {error:.2f} ({where} two standard errors)")
     return ", ".join(parts)
 
