@@ -12,9 +12,9 @@ from gsim3d.evaluate import compare
 from gsim3d.evaluate.pictures import write_curves
 from gsim3d.evaluate.predictions import Predictions
 from gsim3d.evaluate.protocol import check_cameras, default_views, horizon, score_scenes
-from gsim3d.evaluate.report import summarize, table, write_csv, write_json, write_markdown
+from gsim3d.evaluate.report import markdown, summarize, table, write_csv, write_json
 from gsim3d.evaluate.scoring import SceneScores, measurable
-from gsim3d.io.files import output_path, with_parents
+from gsim3d.io.files import output_path, with_parents, write_whole
 from gsim3d.pretrained import FOLDER, located
 from gsim3d.synth.held_out import set_of
 from gsim3d.train.processes import Processes, joined
@@ -189,7 +189,7 @@ def _write(out: Path, data: str, scores: list[SceneScores], summary: dict) -> li
     files = [out, out.with_suffix(".csv"), out.with_suffix(".md")]
     write_json(files[0], summary)
     write_csv(files[1], scores)
-    write_markdown(files[2], summary, Path(data).absolute().name)
+    write_whole(files[2], markdown(summary, Path(data).absolute().name))
     if not summary["by_step"]:
         return files
     rates, curves = summary["fps"], out.with_suffix(".png")

@@ -141,13 +141,8 @@ def write_csv(path: str | Path, scores: Sequence[SceneScores]) -> None:
     write_whole(path, text.getvalue())
 
 
-def write_markdown(path: str | Path, summary: dict, dataset: str) -> None:
-    """Tables as the paper prints them: a row for each method, mean and deviation between scenes; then the horizons."""
-    write_whole(path, markdown(summary, dataset))
-
-
 def markdown(summary: dict, dataset: str) -> str:
-    """The text of :func:`write_markdown`."""
+    """Tables as the paper prints them: a row for each method, mean and deviation between scenes; then the horizons."""
     shown = [m for m in METRICS if any(f"{_prefix(method)}future.{m}" in summary for method in summary["methods"])]
     span = f"{summary['n_encoded_steps']}-{summary['n_future_steps']}"
     head = [f"{METRICS[m].label} ({'↑' if METRICS[m].rises else '↓'})" for m in shown]
