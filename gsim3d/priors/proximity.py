@@ -41,7 +41,7 @@ class ProximityConfig(PriorConfig):
 
 class Proximity(Prior):
     """Features p u and p for each movable particle: u is the way to the background in units of the range, and
-    p = exp(-|u|^2 / 2) the proximity. No gradients."""
+    ``p = exp(-|u|^2 / 2)`` the proximity. No gradients."""
 
     n_features, reads_background = 4, True
 
