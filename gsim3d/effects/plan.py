@@ -25,6 +25,7 @@ class Plan:
         spec: what the scene calls for.
         history: steps that the model sees.
         sh_degree: degree of the spherical harmonics of rendered colours.
+        priors: types of the model's priors, in the order in which they apply.
         switches: (name, setting) of every effect that is on.
         outputs: names of the images that are made.
         unused: parameters of the model that the plan does not read, by name; a checkpoint need not have them.
@@ -33,14 +34,15 @@ class Plan:
     spec: EffectsSpec
     history: int
     sh_degree: int
+    priors: tuple[str, ...]
     switches: tuple[tuple[str, str], ...]
     outputs: tuple[str, ...]
     unused: tuple[str, ...] = ()
 
     @property
     def on(self) -> tuple[str, ...]:
-        """Names of all switches and outputs that are on."""
-        return (*(name for name, _ in self.switches), *self.outputs)
+        """Names of all priors, switches and outputs that are on."""
+        return (*self.priors, *(name for name, _ in self.switches), *self.outputs)
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,9 @@ def make_plan(spec: EffectsSpec, model: ModelConfig) -> Plan:
         ("remove", structure.remove, "by edits"),
     ]
     outputs = tuple(field.name for field in dataclasses.fields(spec.outputs) if getattr(spec.outputs, field.name))
-    return Plan(spec, history, sh_degree, tuple((name, str(what)) for name, on, what in switches if on), outputs)
+    priors = tuple(prior.type for prior in model.dynamics.priors)
+    on = tuple((name, str(what)) for name, is_on, what in switches if is_on)
+    return Plan(spec, history, sh_degree, priors, on, outputs)
 
 
 def _is_asymmetric(spec: EffectsSpec, model: ModelConfig) -> bool:

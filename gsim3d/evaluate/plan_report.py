@@ -27,13 +27,15 @@ def workload(scene: Scene, data: DataConfig) -> Workload:
 
 
 def plan_report(simulator: Simulator, plan: Plan, work: Workload, times: dict, own: Plan) -> Iterator[str]:
-    """Paragraphs: switches and outputs that are on, unused parameters, and the predicted costs of a step.
+    """Paragraphs: priors, switches and outputs that are on, unused parameters, and the predicted costs of a step.
 
     Args:
         times: device -> times of parts of a step that were measured there under the plan ``own``.
     """
     switches = [(name, "switch", setting) for name, setting in plan.switches]
-    yield in_columns([("on", "", ""), *switches, *((name, "output", "image") for name in plan.outputs)])
+    priors = [(name, "prior", f"number {n} of {len(plan.priors)}") for n, name in enumerate(plan.priors, 1)]
+    outputs = [(name, "output", "image") for name in plan.outputs]
+    yield in_columns([("on", "", ""), *priors, *switches, *outputs])
     sizes = {name: p.numel() * p.element_size() for name, p in simulator.named_parameters()}
     unused = sum(sizes[name] for name in plan.unused)
     count = f"{len(plan.unused)} of {len(sizes)}, {unused / 1024:.1f} of {sum(sizes.values()) / 1024:.1f} KiB"
