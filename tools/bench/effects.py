@@ -24,7 +24,7 @@ from gsim3d.state import Particles
 STEPS = 4  # of a rollout
 FROZEN_SHARE = 0.5
 OFF, IDLE = 1.01, 1.05  # times the time without the effect, at most
-HALF_ON = {"structure": {"insert": True, "remove": True}, "dynamics": {"actions": {}, "contact": {}}}
+EDITABLE = {"structure": {"insert": True, "remove": True}}
 EVERY_IMAGE = {"outputs": {"depth": True, "alpha": True}}
 
 
@@ -91,7 +91,7 @@ def rows(config, n: int, device: str):
         images(of_degree_zero(simulator), large, {}),
         OFF,
     )
-    yield "idle: insertion, removal, actions, contact", rollout(simulator, state, HALF_ON), plain[0], IDLE
+    yield "idle: insertion, removal", rollout(simulator, state, EDITABLE), plain[0], IDLE
     yield "idle: sleep", rollout(simulator, state, {"dynamics": {"sleep": {"eps": 0.0}}}), plain[0], IDLE
     yield "idle: depth and alpha images", images(simulator, large, EVERY_IMAGE), plain[1], IDLE
     whole = plain[0] if device == "cpu" else captured(simulator, many, {})

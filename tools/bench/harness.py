@@ -2,7 +2,7 @@
 
     bench = Bench("pool")                                # reads the command line (--help)
     bench.compare("64k rows", ours, plain)               # CPU: callables without arguments; results must agree
-    bench.compare("64k rows, fwd+bwd", *with_gradients(inputs, ours_of, plain_of))
+    bench.passes("64k rows", inputs, ours_of, {"torch": plain_of})   # both devices: forward, forward and backward
     bench.gpu("64k rows", "float32", ours, {"torch": plain}, target_ratio=5, limit_ms=0.04)      # --device cuda
     bench.cost("sleep", with_it, without_it, limit=1.05)    # either device: what one form of a call costs over another
     bench.finish()
@@ -165,6 +165,21 @@ class Bench:
         print(f"{case:<44}{columns}{result['faster']:>8.1f}x{spread:>8.0%}{error:>9.1e}", flush=True)
         self.results.append(result)
         return result
+
+    def passes(self, case: str, inputs: list[Tensor], ours, forms: dict, *, tolerance: float | None = 1e-5, ratio=None,
+               limits_ms=(None, None)) -> None:  # fmt: skip
+        """Compares the forward pass, and both passes, of functions of ``inputs``: on the CPU with the fastest of
+        ``forms``, a function by name, on a GPU with each. ``limits_ms``: of the two rows."""
+        runs = with_gradients(inputs, ours, *forms.values())
+        for n, what in enumerate(("fwd", "fwd+bwd")):
+            sides = [lambda f=f: f(*inputs) for f in (ours, *forms.values())] if n == 0 else runs
+            with torch.set_grad_enabled(n > 0):
+                if self.device.type == "cuda":
+                    dtype, peers = str(inputs[0].dtype).removeprefix("torch."), dict(zip(forms, sides[1:]))
+                    options = {"target_ratio": ratio, "limit_ms": limits_ms[n], "tolerance": tolerance}
+                    self.gpu(f"{case}: {what}", dtype, sides[0], peers, **options)
+                else:
+                    self.compare(f"{case}: {what}", sides[0], min(sides[1:], key=best_seconds), tolerance=tolerance)
 
     def gpu(self, case: str, dtype: str, ours, peers: dict, *, target_ratio=None, limit_ms=None, tolerance=1e-5,
             capture=True, graphs: dict | None = None) -> None:  # fmt: skip

@@ -4,7 +4,7 @@ import math
 
 import torch
 import torch.nn.functional as F
-from harness import Bench, with_gradients
+from harness import Bench
 
 from gsim3d.ops import plane_sweep, sweep_geometry
 
@@ -29,24 +29,7 @@ def plain(features, homographies, translations, inverse_depths, src_images, cu_s
     return cost / (n_sources * math.sqrt(channels))
 
 
-def arguments(n_views, channels, depths, size):
-    generator = torch.Generator().manual_seed(0)
-    K = torch.tensor([[1.1 * size, 0, size / 2], [0, 1.1 * size, size / 2], [0, 0, 1]]).double()
-    viewmats = torch.eye(4, dtype=torch.float64).repeat(n_views, 1, 1)
-    for i in range(n_views):
-        angle = 0.6 * math.pi / 2 * i
-        viewmats[i, 0, 0] = viewmats[i, 2, 2] = math.cos(angle)
-        viewmats[i, 0, 2], viewmats[i, 2, 0] = math.sin(angle), -math.sin(angle)
-        viewmats[i, 2, 3] = 3.0
-    sources = torch.tensor([(i + s) % n_views for i in range(n_views) for s in range(1, n_views)])
-    cu_src = torch.arange(n_views + 1) * (n_views - 1)
-    A, b = sweep_geometry(K.repeat(n_views, 1, 1), viewmats, sources, cu_src)
-    features = torch.randn(n_views, channels, size, size, generator=generator)
-    inverse_depths = torch.linspace(1 / 6, 1 / 1.5, depths).repeat(n_views, 1)
-    return features, A.float(), b.float(), inverse_depths, sources, cu_src
-
-
-def scenes_on_rings(n_scenes, channels, depths, size):
+def scenes_on_rings(n_scenes, channels, depths, size, device):
     """Four views a scene, a quarter turn apart on a ring of 3.5 m, every other view a source of each."""
     n_views = 4
     angle = torch.arange(n_views) * (math.pi / 2)
@@ -63,14 +46,17 @@ def scenes_on_rings(n_scenes, channels, depths, size):
     A, b = sweep_geometry(K.repeat(n, 1, 1), viewmats.repeat(n_scenes, 1, 1), sources, cu_src)
     features = torch.randn(n, channels, size, size, generator=torch.Generator().manual_seed(9))
     inverse_depths = torch.linspace(1 / 8, 1 / 1.5, depths).repeat(n, 1)
-    return [t.cuda() for t in (features, A, b, inverse_depths, sources, cu_src)]
+    return [t.to(device) for t in (features, A, b, inverse_depths, sources, cu_src)]
 
 
-def gpu(bench):
-    limits = {32: (0.016, 0.05), 64: (0.26, 0.8)}
-    for size, target in ((32, 45), (64, 25)):
-        features, *geometry = scenes_on_rings(4, 128, 64, size)
-        case = f"4 scenes x 4 views, {size}x{size}x128, D=64"
+def main():
+    bench = Bench("plane_sweep")
+    cases = ((1, 64, 64, 32, {}), (1, 128, 64, 32, {}), (1, 32, 24, 16, {}))
+    if bench.device.type == "cuda":
+        small, large = {"ratio": 45, "limits_ms": (0.016, 0.05)}, {"ratio": 25, "limits_ms": (0.26, 0.8)}
+        cases = ((4, 128, 64, 32, small), (4, 128, 64, 64, large))
+    for n_scenes, channels, depths, size, goals in cases:
+        features, *geometry = scenes_on_rings(n_scenes, channels, depths, size, bench.device)
 
         def ours(f):
             return plane_sweep(f, *geometry)
@@ -78,39 +64,8 @@ def gpu(bench):
         def grid_sample(f):
             return plain(f, *geometry)
 
-        ours_both, plain_both = with_gradients([features], ours, grid_sample)
-        for name, run, peer, limit in (
-            ("fwd", lambda: ours(features), lambda: grid_sample(features), limits[size][0]),
-            ("fwd+bwd", ours_both, plain_both, limits[size][1]),
-        ):
-            bench.gpu(
-                f"{case}: {name}",
-                "float32",
-                run,
-                {"grid_sample": peer},
-                target_ratio=target,
-                limit_ms=limit,
-                tolerance=TOLERANCE,
-            )
-
-
-def main():
-    bench = Bench("plane_sweep")
-    if bench.device.type == "cuda":
-        gpu(bench)
-        return bench.finish()
-    for n_views, channels, depths, size in ((4, 64, 64, 32), (4, 128, 64, 32), (4, 32, 24, 16)):
-        features, *geometry = arguments(n_views, channels, depths, size)
-
-        def ours(f):
-            return plane_sweep(f, *geometry)
-
-        def torch_form(f):
-            return plain(f, *geometry)
-
-        case = f"{n_views} views {size}x{size}x{channels}, D={depths}"
-        bench.compare(case, lambda: ours(features), lambda: torch_form(features), tolerance=TOLERANCE)
-        bench.compare(f"{case}, fwd+bwd", *with_gradients([features], ours, torch_form), tolerance=TOLERANCE)
+        case = f"{n_scenes} scenes x 4 views, {size}x{size}x{channels}, D={depths}"
+        bench.passes(case, [features], ours, {"grid_sample": grid_sample}, tolerance=TOLERANCE, **goals)
     bench.finish()
 
 

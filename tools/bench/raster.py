@@ -7,56 +7,11 @@ import torch
 from harness import Bench
 from raster_scenes import layered_scene, packed, pixel_aligned_scene, repeated, sh_of
 
-from gsim3d.cameras import Cameras
+from gsim3d.math.spherical_harmonics import sh_basis
 from gsim3d.ops import rasterize_gaussians
 
 SIZE, IMAGES, TILE = 128, 4, 16
 FOCAL = 1.1 * SIZE
-
-
-def scene(sh_terms, seed=0):
-    """What a feed-forward model gives: every pixel of a camera, unprojected onto a wavy sheet behind a ball, seen
-    by another camera. One cloud an image."""
-    g = torch.Generator().manual_seed(seed)
-    n = IMAGES * SIZE * SIZE
-    y, x = torch.meshgrid(torch.arange(SIZE) + 0.5, torch.arange(SIZE) + 0.5, indexing="ij")
-    rays = torch.stack([(x - SIZE / 2) / FOCAL, (y - SIZE / 2) / FOCAL, torch.ones_like(x)], -1).reshape(-1, 3)
-    rays = rays.repeat(IMAGES, 1)
-    depth = 3 + 0.3 * torch.sin(9 * rays[:, 0]) * torch.cos(7 * rays[:, 1])
-    depth = torch.where(rays[:, :2].norm(dim=1) < 0.2, 2.0 + rays[:, :2].square().sum(1), depth)
-    depth = depth * (1 + 0.01 * torch.randn(n, generator=g))
-    angle = torch.tensor([0.05, -0.1, 0.15, -0.2])[:IMAGES]
-    viewmats = torch.eye(4).repeat(IMAGES, 1, 1)
-    viewmats[:, 0, 0] = viewmats[:, 2, 2] = angle.cos()
-    viewmats[:, 0, 2], viewmats[:, 2, 0] = angle.sin(), -angle.sin()
-    viewmats[:, 0, 3], viewmats[:, 2, 3] = -3 * angle.sin(), 3 - 3 * angle.cos()
-    size = 0.7 * depth[:, None] / FOCAL
-    inputs = [
-        rays * depth[:, None],
-        torch.randn(n, 4, generator=g),
-        size * torch.exp(0.5 * torch.randn(n, 3, generator=g)),
-        torch.sigmoid(0.5 + 1.5 * torch.randn(n, generator=g)),
-        0.3 * torch.randn(n, sh_terms, 3, generator=g),
-    ]
-    K = torch.tensor([[FOCAL, 0, SIZE / 2], [0, FOCAL, SIZE / 2], [0, 0, 1]]).repeat(IMAGES, 1, 1)
-    ones, images = torch.ones(IMAGES), torch.arange(IMAGES)
-    cameras = Cameras(viewmats, K, 0.1 * ones, 10 * ones, images, SIZE, SIZE)
-    return inputs, cameras, torch.arange(IMAGES + 1) * SIZE * SIZE
-
-
-def sh_color(sh, d):
-    """Real spherical harmonics of degree 0 or 3."""
-    basis = [torch.full_like(d[:, 0], 0.28209479177387814)]
-    if sh.shape[1] == 16:
-        x, y, z = d.unbind(1)
-        xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
-        basis += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
-        basis += [1.0925484305920792 * xy, -1.0925484305920792 * yz, 0.31539156525252005 * (2 * zz - xx - yy)]
-        basis += [-1.0925484305920792 * xz, 0.5462742152960396 * (xx - yy), -0.5900435899266435 * y * (3 * xx - yy)]
-        basis += [2.890611442640554 * xy * z, -0.4570457994644658 * y * (4 * zz - xx - yy)]
-        basis += [0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy), -0.4570457994644658 * x * (4 * zz - xx - yy)]
-        basis += [1.445305721320277 * z * (xx - yy), -0.5900435899266435 * x * (xx - 3 * yy)]
-    return (torch.einsum("nk,nkc->nc", torch.stack(basis, 1), sh) + 0.5).clamp_min(0)
 
 
 def project(means, quats, scales, opacities, sh, W, t):
@@ -78,7 +33,8 @@ def project(means, quats, scales, opacities, sh, W, t):
     det = xx * yy - xy * xy
     conic = torch.stack([yy, -xy, xx], 1) / det[:, None]
     mean = FOCAL * p[:, :2] / z[:, None] + SIZE / 2
-    color = sh_color(sh, torch.nn.functional.normalize(p @ W, dim=1))
+    basis = sh_basis(torch.nn.functional.normalize(p @ W, dim=1), math.isqrt(sh.shape[1]) - 1)
+    color = (torch.einsum("nk,nkc->nc", basis, sh) + 0.5).clamp_min(0)
     with torch.no_grad():
         level = 2 * torch.log((255 * opacities).clamp_min(1e-6))
         reach = (level.clamp_min(0)[:, None] * torch.stack([xx, yy], 1)).sqrt()
@@ -211,7 +167,10 @@ def main():
         gpu(bench)
         return bench.finish()
     for sh_terms in (1, 16):
-        inputs, cameras, cu_rows = scene(sh_terms)
+        given = pixel_aligned_scene(IMAGES, SIZE, 1, 13, bench.device, context=1)
+        cameras, cu_rows = packed(given)
+        sh = sh_of(given, math.isqrt(sh_terms) - 1, 7)
+        inputs = [given[key].flatten(0, 1) for key in ("means", "quats", "scales", "opacities")] + [sh.flatten(0, 1)]
 
         def ours(x):
             out = rasterize_gaussians(*x[:4], cameras, sh=x[4], cu_rows=cu_rows)

@@ -22,19 +22,19 @@ def ring_of_cameras(phase: float, device, radius=3.5, height=1.6) -> torch.Tenso
     return pose
 
 
-def pixel_aligned_scene(clouds: int, size: int, views: int, seed: int, device) -> dict:
-    """What a feed-forward model gives: every pixel of 4 cameras, unprojected onto a ball on a ground disc before a
-    wall; each Gaussian about a pixel wide. ``views`` cameras of the same ring look at it."""
+def pixel_aligned_scene(clouds: int, size: int, views: int, seed: int, device, context: int = CONTEXT) -> dict:
+    """What a feed-forward model gives: every pixel of ``context`` cameras, unprojected onto a ball on a ground disc
+    before a wall; each Gaussian about a pixel wide. ``views`` cameras of the same ring look at it."""
     g = torch.Generator(device=device).manual_seed(seed)
     parts = {name: [] for name in ("means", "scales", "quats", "opacities", "viewmats")}
     centres = (torch.arange(size, device=device) + 0.5) / size
     row, column = torch.meshgrid(centres, centres, indexing="ij")
     rays = torch.stack([(column - 0.5) / FOCAL, (row - 0.5) / FOCAL, torch.ones_like(row)], -1).reshape(-1, 3)
-    never = torch.full((CONTEXT, size * size), 1e9, device=device)
+    never = torch.full((context, size * size), 1e9, device=device)
     for cloud in range(clouds):
         cameras = ring_of_cameras(0.1 * cloud, device)
         chosen = torch.randperm(RING, generator=g, device=device)
-        to_world = torch.inverse(cameras[chosen[:CONTEXT]])
+        to_world = torch.inverse(cameras[chosen[:context]])
         direction = rays @ to_world[:, :3, :3].transpose(1, 2)
         origin = to_world[:, None, :3, 3].expand_as(direction)
         ball = direction.new_tensor([0.3 * math.cos(cloud), 0.3 * math.sin(cloud), 0.1])

@@ -2,9 +2,9 @@
 
     python tools/bench/stability.py [--device cuda] [--seconds 5]
 
-Guards are one look at all rows where a state enters and after every step, and the counts of the rasterizer. The peer is
-the same without guards; results are the same bits. On a GPU of eager calls, which wait for Python, and of replays of
-two CUDA graphs.
+Guards are one pass over all particles where a state enters and after every step, and the counts of the rasterizer. The
+peer is the same without guards; results are the same bits. On a GPU of eager calls, which wait for Python, and of
+replays of two CUDA graphs.
 """
 
 import math
@@ -13,6 +13,7 @@ from functools import partial
 
 import torch
 from harness import Bench
+from sleeping import scene, view
 
 import gsim3d.numerics.validate
 import gsim3d.simulator
@@ -25,40 +26,9 @@ from gsim3d.state import Particles
 STEPS = 4  # of a rollout
 
 
-def state_of(simulator: Simulator, n: int, device: torch.device) -> Particles:
-    """One scene, n particles in each of as many steps as the model sees: a ball above the ground."""
-    g = torch.Generator().manual_seed(0)
-    dynamics = simulator.config.dynamics
-    n_steps = 2**dynamics.history_bits
-    direction = torch.randn(n, 3, generator=g)
-    body = direction / direction.norm(dim=1, keepdim=True) * 0.3 * torch.rand(n, 1, generator=g).pow(1 / 3)
-    means = torch.cat([body + torch.tensor([0.0, 0.0, -0.03 * t]) for t in range(n_steps)])
-    state = Particles(
-        means=means,
-        opacities=0.05 + 0.9 * torch.rand(n_steps * n, generator=g),
-        dynamic_latents=0.3 * torch.randn(n_steps * n, dynamics.dynamic_latents, generator=g),
-        static_latents=0.3 * torch.randn(n_steps * n, dynamics.static_latents, generator=g),
-        cu_rows=torch.arange(0, (n_steps + 1) * n, n),
-        cloud_scene=torch.zeros(n_steps, dtype=torch.int64),
-        cloud_step=torch.arange(n_steps),
-        activity=torch.zeros(n_steps * n, dtype=torch.uint8),
-        origin=torch.full((1, 3), -2.0, dtype=torch.float64),
-    )
-    return state.to(device)
-
-
-def camera(device: torch.device) -> Cameras:
-    pose = torch.eye(4)
-    pose[2, 3] = 1.5
-    K = torch.tensor([[150.0, 0.0, 64.0], [0.0, 150.0, 64.0], [0.0, 0.0, 1.0]])
-    one = torch.ones(1)
-    cameras = Cameras(pose[None], K[None], 0.5 * one, 4 * one, torch.zeros(1, dtype=torch.int64), 128, 128)
-    return cameras.to(device)
-
-
 @contextmanager
 def no_guards():
-    """Within it states pass unseen, and nobody counts what the rasterizer leaves out."""
+    """Within it states are not validated, and what the rasterizer leaves out is not counted."""
     guard, render = gsim3d.simulator.validate_particles, gsim3d.simulator.render
     gsim3d.simulator.validate_particles = lambda particles, *args, **options: particles
 
@@ -119,7 +89,8 @@ def main():
     for name, config, n in cases:
         torch.manual_seed(0)
         simulator = Simulator(config).to(bench.device).eval()
-        state, cameras = state_of(simulator, n, bench.device), camera(bench.device)
+        n_steps = 2**config.dynamics.history_bits
+        state, cameras = scene(simulator, n_steps, n, 0.0, bench.args.device), view(bench.args.device)
         run = run_of(simulator, state, cameras)
         case = f"{name}, {n} particles: {STEPS} steps"
         bench.cost(case + ", 1 image", run, without_guards(run))

@@ -12,11 +12,9 @@ efficiency of scaling is the time of a step in one process, measured before they
 from __future__ import annotations
 
 import argparse
-import collections
 import functools
 import json
 import os
-import re
 import statistics
 import subprocess
 import sys
@@ -29,7 +27,6 @@ from pathlib import Path
 import surface_scene
 import torch
 from harness import RESULTS, commit
-from torch.profiler import ProfilerActivity, profile
 
 from gsim3d.train.config import DataConfig, PhaseConfig, PrecisionConfig, TrainConfig
 from gsim3d.train.log import memory_gib
@@ -132,11 +129,6 @@ def measure(name: str, args: argparse.Namespace, processes: Processes) -> dict:
         trainer = make_trainer(name, args, processes, folder)
         seconds, entry = timed_steps(trainer, args, processes)
         memory = max(processes.gather(memory_gib(args.device)))
-        if processes.count == 1:
-            if args.stages:
-                print_stages(trainer, args.device)
-            if args.top:
-                print_kernels(trainer, args.top)
     row = {
         "case": name,
         "preset": args.preset,
@@ -167,87 +159,6 @@ def alone(args: argparse.Namespace) -> dict[str, float]:
         return {row["case"]: row["seconds"] for row in json.loads(file.read_text())} if file.exists() else {}
 
 
-class Stages:
-    """When one step came to the ends of its parts: on the device, and in Python, which runs ahead; and its memory."""
-
-    def __init__(self, trainer: Trainer, device: str):
-        self._device, self._marks, self._forward = device, [], True
-        simulator = trainer.simulator
-        self._end(trainer, "_batch", "batch")
-        self._end(simulator, "encode", "encode", lambda state: self._reached(state, "steps backward"))
-        self._end(simulator, "rollout", "steps", lambda steps: self._reached(steps[-1], "images backward"))
-        self._end(simulator, "render", "images")
-        check = trainer._check
-
-        def after_gradients(*arguments):
-            self.mark("encoder backward")
-            return check(*arguments)
-
-        trainer._check = after_gradients
-
-    def mark(self, name: str) -> None:
-        event, gib = None, memory_gib(self._device)
-        if self._device == "cuda":
-            event = torch.cuda.Event(enable_timing=True)
-            event.record()
-            torch.cuda.reset_peak_memory_stats()
-        self._marks.append((name, event, time.perf_counter(), gib))
-
-    def rows(self) -> list[tuple[str, float, float, float]]:
-        """(part, milliseconds on the device, milliseconds of Python, GiB at most)."""
-        if self._device == "cuda":
-            torch.cuda.synchronize()
-        rows = []
-        for (_, before, earlier, _), (name, event, later, gib) in zip(self._marks, self._marks[1:]):
-            host = 1e3 * (later - earlier)
-            rows.append((name, before.elapsed_time(event) if event else host, host, gib))
-        return rows
-
-    def _end(self, owner, attribute: str, name: str, then=lambda result: None) -> None:
-        """Marks the end of the first call of a method; later ones belong to a backward pass that computes again."""
-        called, done = getattr(owner, attribute), []
-
-        def method(*arguments, **options):
-            result = called(*arguments, **options)
-            if not done:
-                done.append(True)
-                self.mark(name)
-                then(result)
-            return result
-
-        setattr(owner, attribute, method)
-
-    def _reached(self, particles, name: str) -> None:
-        """Marks when the gradient has come back to ``particles``."""
-        particles.dynamic_latents.register_hook(lambda gradient: self.mark(name))
-
-
-def print_stages(trainer: Trainer, device: str) -> None:
-    stages = Stages(trainer, device)
-    stages.mark("start")
-    trainer.train_step()
-    stages.mark("clipping, AdamW, averages")
-    for name, on_device, host, gib in stages.rows():
-        print(f"    {name:<28}{on_device:9.1f} ms, issued in {host:9.1f} ms, {gib:6.1f} GiB", flush=True)
-
-
-def print_kernels(trainer: Trainer, n_rows: int) -> None:
-    """The kernels that took longest in one more step."""
-    with profile(activities=[ProfilerActivity.CUDA]) as traced:
-        trainer.train_step()
-        torch.cuda.synchronize()
-    times = collections.defaultdict(lambda: [0.0, 0])
-    for event in traced.events():
-        name = re.sub(r"void |at::native::|gsim3d::|cuda::|\(anonymous namespace\)::|<unnamed>::", "", event.name)
-        if "CUDA" in str(event.device_type):
-            times[name[:110]][0] += event.device_time
-            times[name[:110]][1] += 1
-    total, launches = (sum(column) for column in zip(*times.values(), strict=True))
-    print(f"    {total / 1e3:.1f} ms of kernels and copies, {launches} launches")
-    for name, (spent, count) in sorted(times.items(), key=lambda item: -item[1][0])[:n_rows]:
-        print(f"    {spent / 1e3:9.2f} ms {count:6d} x {spent / count:8.1f} us  {name}", flush=True)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
@@ -257,8 +168,6 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=128, help="pixels")
     parser.add_argument("--steps", type=int, default=3, help="that are timed; the median is shown")
     parser.add_argument("--warm-up", type=int, default=2, help="steps before them")
-    parser.add_argument("--stages", action="store_true", help="of one process, also time the parts of one more step")
-    parser.add_argument("--top", type=int, default=0, help="of one process, also list so many kernels of one more step")
     parser.add_argument("--json", type=Path, help="write the rows here; on a GPU default tools/bench/results")
     args = parser.parse_args()
     rows, failed, file = [], [], args.json
