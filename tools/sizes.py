@@ -48,7 +48,8 @@ def sizes() -> list[Size]:
     longest, where = max(
         (lines, f"{path.relative_to(ROOT)}:{name}") for path in library for name, lines in _functions(path)
     )
-    pages = [page for page in (ROOT / "docs").rglob("*.md") if "notes" not in page.parts and "_build" not in page.parts]
+    apart = {"notes", "_build", "_generated"}
+    pages = [page for page in (ROOT / "docs").rglob("*.md") if apart.isdisjoint(page.parts)]
     pages += [page for page in ROOT.glob("*.md") if page.name != "CHANGELOG.md"]
     words = sum(len(page.read_text().split()) for page in pages)
     forward = dict(_functions(PACKAGE / "dynamics" / "model.py")).get("Dynamics.forward", 0)
