@@ -7,7 +7,7 @@
 A graph repeats the same kernels on the same memory, so that nothing in it may have a size that depends on particles:
 geometry is made with given sizes (:class:`gsim3d.ops.PyramidCapacity`), observed in a first rollout and multiplied by
 ``factor``. Particles that need more are noticed by a flag that is read when the replay is over; the rollout is then
-captured anew with room for them, and repeated.
+captured anew with more capacity, and repeated.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from gsim3d.ops.curve import Pyramid, PyramidCapacity
 from gsim3d.ops.raster import Rendering
 from gsim3d.state import DYNAMIC, CloudTable, Particles, keeping_constants, newest_clouds
 
-FACTOR = 1.25  # room over what was observed
-# What errors for it say: torch's, and those of ops, which say no more.
-NO_ROOM = "out of memory", "DefaultCPUAllocator", "STATUS_ALLOC_FAILED", "aten::new_empty"
+FACTOR = 1.25  # capacity over what was observed
+# In messages of errors for lack of memory: torch's, and those of ops, which say no more.
+OUT_OF_MEMORY = "out of memory", "DefaultCPUAllocator", "STATUS_ALLOC_FAILED", "aten::new_empty"
 
 
 class Captured:
@@ -50,7 +50,7 @@ class Captured:
         function: is called twice before it is captured.
         device: of all that it does.
         pool: of torch.cuda.graph_pool_handle(), memory that graphs share which run one after another, and whose results
-            nobody reads once another of them has run; None: its own.
+            are not read once another of them has run; None: its own.
     Raises:
         CaptureError: it cannot be captured; the message repeats CUDA's.
     """
@@ -71,7 +71,9 @@ class Captured:
             with torch.cuda.device(self._device), keeping_constants(self._constants):
                 self._capture(function, pool)
         except (RuntimeError, MemoryError) as error:
-            raise CaptureError(f"Captured: {str(error).splitlines()[0]}", no_room=has_no_room(error)) from error
+            raise CaptureError(
+                f"Captured: {str(error).splitlines()[0]}", out_of_memory=is_out_of_memory(error)
+            ) from error
         finally:
             torch.set_autocast_cache_enabled(cached)
 
@@ -93,10 +95,10 @@ class Captured:
         return self.result
 
 
-def has_no_room(error: BaseException) -> bool:
+def is_out_of_memory(error: BaseException) -> bool:
     """Whether it was raised because memory was lacking."""
     return any(
-        isinstance(cause, MemoryError) or any(text in str(cause) for text in NO_ROOM) for cause in _causes(error)
+        isinstance(cause, MemoryError) or any(text in str(cause) for text in OUT_OF_MEMORY) for cause in _causes(error)
     )
 
 
@@ -119,9 +121,13 @@ def collecting_nothing() -> Iterator[None]:
             gc.enable()
 
 
-class Predicted(NamedTuple):
-    """steps: one Particles a step, as of :meth:`gsim3d.simulator.Simulator.rollout`. renderings: one a step; none
-    without cameras."""
+class Prediction(NamedTuple):
+    """The steps of a rollout and their images.
+
+    Attributes:
+        steps: particles of each predicted step, one cloud a scene.
+        renderings: images of each step; empty where no cameras were given.
+    """
 
     steps: list[Particles]
     renderings: list[Rendering]
@@ -130,32 +136,32 @@ class Predicted(NamedTuple):
 class CapturedRollout:
     """:meth:`Simulator.rollout`, and a rendering of every step, replayed from a CUDA graph. Without gradients.
 
-    The graph belongs to the numbers of rows, scenes and steps of ``state``, to the plan, to autocast as it is when the
-    object is made, and to the model in evaluation. Under autocast the weights of matrix products and convolutions are
-    rounded once, into a copy: call :meth:`reload` after the model has changed. Else the graph reads the model's own.
+    The graph belongs to the numbers of particles, scenes and steps of ``state``, to the plan, to autocast as it is when
+    the object is made, and to the model in evaluation. Under autocast the weights of matrix products and convolutions
+    are rounded once, into a copy: call :meth:`reload` after the model has changed. Else it reads the model's own.
 
-    With a model of ``background="asymmetric"`` the graph advances what moves, as many rows in every call. The
-    background is computed beside the graph whenever it has changed (call :meth:`reload` after the model has); where it
-    needs more room the graph is made anew. A graph knows no sleep: it advances the same rows always.
+    With ``background="asymmetric"`` the graph advances the movable particles, as many in every call. The frozen context
+    is computed outside of the graph whenever it has changed (call :meth:`reload` after the model has); where it needs
+    more capacity the graph is captured anew. Particles do not sleep in a graph.
 
     On the CPU there are no graphs: calls run the same steps one by one, with the same sizes and the same results.
 
     Args:
         simulator: :class:`gsim3d.Simulator` in evaluation mode.
-        state: as of ``simulator.rollout``; says how many rows each cloud has.
+        state: last steps of every scene; its clouds fix the numbers of particles.
         n_steps: how many steps to predict.
-        plan: what to compute; default everything the model can.
+        plan: what to compute; default that of ``simulator.plan()``.
         cameras: render these of every step, which has one cloud a scene.
         background: of the images, [3] or [I, 3], default black.
-        factor: room for geometry over what the rollout of ``state`` needs, at least 1.
+        factor: capacity of the geometry over what the rollout of ``state`` needs, at least 1.
         copies: results are copies; False: the graph's own memory, which the next call overwrites.
-        report: is told what the simulator's guards find; default ``simulator.report``.
-        cutoff: of Gaussians, as of :meth:`Simulator.render`.
+        report: counts numbers that cannot be used; default ``simulator.report``.
+        cutoff: of Gaussians, see :meth:`Simulator.render`.
     Raises:
         InputError: an argument does not fit; the message names it.
 
     Attributes:
-        captures: how often the graph was made, 1 as long as everything had room.
+        captures: how often the graph was captured, 1 as long as the capacity sufficed.
     """
 
     def __init__(
@@ -186,9 +192,9 @@ class CapturedRollout:
         self._report.poll()
         self._background, self._cutoff = background, cutoff
         if self._plan.spec.dynamics.sleep is not None:
-            raise InputError("CapturedRollout: plan must be one without dynamics.sleep; a graph knows no sleep")
+            raise InputError("CapturedRollout: plan must be one without dynamics.sleep: it is not part of a graph")
         prepared = simulator._prepare(state, self._plan)
-        self._table, self._state, self._rest = prepared.clouds, _own(prepared), None
+        self._table, self._state, self._frozen = prepared.clouds, _own(prepared), None
         self._cameras = None if cameras is None else cameras.map(torch.clone)
         self._device = prepared.means.device
         kind = self._device.type
@@ -196,22 +202,22 @@ class CapturedRollout:
         self._model = simulator
         if self._dtype is not None and kind == "cuda":
             self._model = copy.copy(simulator)
-            rooms = {name: rounded(room, self._dtype) for name, room in _rooms(simulator).items()}
-            self._model.__dict__["_modules"] = {**simulator._modules, **rooms}
+            parts = {name: rounded(part, self._dtype) for name, part in _parts_of(simulator).items()}
+            self._model.__dict__["_modules"] = {**simulator._modules, **parts}
         self.captures = 0
         self._launched = self._is_stale = False
         if simulator.config.dynamics.is_asymmetric:
             parts = simulator._parts(prepared, report=self._report)
             if parts.nothing_moves:
-                raise InputError("CapturedRollout: state has no row that moves; there is nothing to capture")
+                raise InputError("CapturedRollout: state has no particle that moves; there is nothing to capture")
             self._state = _own(parts.moving)
             own = Partition(_own(parts.newest), self._state, _own(parts.background), parts.rows.clone())
-            self._rest = _Rest(own, self._remember(parts.background))
-        self._moving = self._room_for(int(self._count_moving()))
-        self._make_room(self._observed())
+            self._frozen = _Frozen(own, self._remember(parts.background))
+        self._moving = self._capacity_for(int(self._count_moving()))
+        self._resize(self._observed())
 
-    def __call__(self, state: Particles, cameras: Cameras | None = None) -> Predicted:
-        """The rollout of ``state``, which has as many rows, scenes and steps as the first one.
+    def __call__(self, state: Particles, cameras: Cameras | None = None) -> Prediction:
+        """The rollout of ``state``, which has as many particles, scenes and steps as the first one.
 
         Args:
             state: steps may be numbered otherwise.
@@ -223,8 +229,8 @@ class CapturedRollout:
         return self.finish()
 
     def launch(self, state: Particles, cameras: Cameras | None = None) -> None:
-        """Starts what :meth:`__call__` does and waits for nothing (except to leave out a masked background, and to tell
-        an asymmetric one from what moves).
+        """Starts what :meth:`__call__` does and waits for nothing (except to leave out a masked background, and to
+        separate an asymmetric one).
 
         Raises:
             NumericalError: of an earlier call, under the policy "raise".
@@ -232,7 +238,7 @@ class CapturedRollout:
         state = self._simulator._prepare(state, self._plan)
         self._check(state, self._table)
         tables, self._world_offset = state.clouds, state.world_offset
-        if self._rest is not None:
+        if self._frozen is not None:
             state = self._load_parts(self._simulator._parts(state, report=self._report))
         _copy(self._state, state)
         if cameras is not None:
@@ -242,16 +248,16 @@ class CapturedRollout:
         self._replay()
         self._report.poll()  # here the host reads while the device works
 
-    def finish(self) -> Predicted:
-        """Waits for what was launched; repeats it with more room where it did not fit."""
+    def finish(self) -> Prediction:
+        """Waits for what was launched; repeats it with more capacity where it did not fit."""
         if not self._launched:
             raise InputError("CapturedRollout: finish() must follow launch()")
         self._launched = False
         found, moving, counted = self._arrive()
         while moving > self._moving or not self._fits(found):
-            self._moving = max(self._moving, self._room_for(moving))
+            self._moving = max(self._moving, self._capacity_for(moving))
             needed = zip(self._grown(found), self._observed(), strict=True)
-            self._make_room([a.grown((0, *b.sizes)) for a, b in needed])
+            self._resize([a.grown((0, *b.sizes)) for a, b in needed])
             self._replay()
             found, moving, counted = self._arrive()
         self._records.replayed(self._report, counted)
@@ -262,27 +268,29 @@ class CapturedRollout:
         self._is_stale = True
         if self._model is not self._simulator:
             with torch.no_grad():
-                for own, given in zip(_rooms(self._model).values(), _rooms(self._simulator).values(), strict=True):
+                for own, given in zip(
+                    _parts_of(self._model).values(), _parts_of(self._simulator).values(), strict=True
+                ):
                     for name, value in given.state_dict().items():
                         own.state_dict()[name].copy_(value)
 
     # ---- what runs ----
 
-    def _rollout(self, geometry, report: StabilityReport) -> Predicted:
+    def _rollout(self, geometry, report: StabilityReport) -> Prediction:
         """The rollout of the graph's own state."""
-        plan, rest = with_background_as_it_is(self._plan), self._rest
+        plan, frozen = of_prepared_state(self._plan), self._frozen
         options, renderings = {"geometry": geometry, "report": report}, []
         at_most = self._model.dynamics.moving_at_most(self._moving)
         with torch.no_grad(), self._autocast(), at_most:
-            if rest is None:
+            if frozen is None:
                 steps = self._model.rollout(self._state, self._n_steps, plan, **options)
             else:
-                moving = self._model._advance(self._state, rest.background, self._n_steps, plan, **options)
-                steps = [rest.parts.whole(step, 1 + i) for i, step in enumerate(moving)]
+                moving = self._model._advance(self._state, frozen.context, self._n_steps, plan, **options)
+                steps = [frozen.partition.whole(step, 1 + i) for i, step in enumerate(moving)]
             if self._cameras is not None:
                 drawn = {"plan": self._drawn, "cutoff": self._cutoff, "report": report}
                 renderings += [self._model._draw(step, self._cameras, self._background, **drawn) for step in steps]
-        return Predicted(steps, renderings)
+        return Prediction(steps, renderings)
 
     def _autocast(self) -> torch.autocast:
         return torch.autocast(self._device.type, self._dtype, enabled=self._dtype is not None, cache_enabled=False)
@@ -292,7 +300,7 @@ class CapturedRollout:
             return self._model.dynamics.remember(background).with_room(self._factor)
 
     def _observed(self) -> list[PyramidCapacity]:
-        """What the calls of the dynamics need, with room; from a rollout that waits for every count."""
+        """Capacities that the calls of the dynamics need; from a rollout that waits for every count."""
         needed = []
 
         def geometry(history: Particles) -> Pyramid:
@@ -304,18 +312,18 @@ class CapturedRollout:
         return needed
 
     def _count_moving(self) -> Tensor:
-        """int64 [1], rows of a scene of the graph's own state that may move, at most."""
+        """int64 [1], largest number of movable particles of a scene of the graph's own state."""
         table, until = self._state.clouds, F.pad((self._state.activity == DYNAMIC).cumsum(0), (1, 0))
         counts = [until[table.starts[q + 1]] - until[table.starts[q]] for q in newest_clouds(table)]
         return torch.stack(counts).amax(0, keepdim=True)
 
-    def _room_for(self, moving: int) -> int:
+    def _capacity_for(self, moving: int) -> int:
         return min(self._state.n_rows, math.ceil(self._factor * moving))
 
     def _fits(self, found: list[list[int]]) -> bool:
         return all([capacity.fits(numbers) for capacity, numbers in zip(self._capacities, found, strict=True)])
 
-    def _given(self, report: StabilityReport) -> tuple[Predicted, Tensor]:
+    def _given(self, report: StabilityReport) -> tuple[Prediction, Tensor]:
         """The rollout with the sizes of this object, and what the geometry of every call found."""
         sizes, found = iter(self._capacities), []
 
@@ -326,7 +334,7 @@ class CapturedRollout:
         predicted = self._rollout(geometry, report)
         return predicted, torch.stack([pyramid.found for pyramid in found])
 
-    def _make_room(self, capacities: list[PyramidCapacity]) -> None:
+    def _resize(self, capacities: list[PyramidCapacity]) -> None:
         """Takes ``capacities`` as sizes and, on a GPU, makes the graph."""
         self._capacities, self._records = capacities, StabilityReport()
         self.captures += 1
@@ -339,7 +347,7 @@ class CapturedRollout:
         self._on_host = torch.empty(self._packed.shape, dtype=self._packed.dtype, pin_memory=True)
         self._arrived = torch.cuda.Event()
 
-    def _capture(self) -> tuple[Predicted, Tensor, Tensor]:
+    def _capture(self) -> tuple[Prediction, Tensor, Tensor]:
         report = self._records if torch.cuda.is_current_stream_capturing() else StabilityReport()
         predicted, found = self._given(report)
         return predicted, found, pack([found, self._count_moving(), *report.captured()])
@@ -355,8 +363,8 @@ class CapturedRollout:
             self._arrived.record()
 
     def _arrive(self) -> tuple[list[list[int]], int, Tensor | None]:
-        """Waits for the replay: what the geometry of every call found, rows that may move, and what the guards of a
-        graph counted."""
+        """Waits for the replay: what the geometry of every call found, rows that may move, and what the
+        validation in the graph counted."""
         if self._device.type != "cuda":
             return self._found.tolist(), int(self._count_moving()), None
         self._arrived.synchronize()
@@ -370,8 +378,8 @@ class CapturedRollout:
     # ---- what goes in and comes out ----
 
     def _load_parts(self, parts: Partition) -> Particles:
-        """Takes what rests into the graph's memory; what moves."""
-        own = self._rest.parts
+        """Copies the frozen particles into the graph's memory; returns the movable ones."""
+        own = self._frozen.partition
         self._check(parts.moving, own.moving.clouds, " in what moves")
         background = parts.background.row_fields()
         changed = self._is_stale or not all(
@@ -383,9 +391,9 @@ class CapturedRollout:
         if changed:
             self._is_stale = False
             remembered = self._remember(parts.background)
-            if not self._rest.background.load(remembered):
-                self._rest = _Rest(own, remembered)
-                self._make_room(self._observed())
+            if not self._frozen.context.load(remembered):
+                self._frozen = _Frozen(own, remembered)
+                self._resize(self._observed())
         return parts.moving
 
     def _check(self, state: Particles, own: CloudTable, where: str = "") -> None:
@@ -418,7 +426,7 @@ class CapturedRollout:
         for name in ("viewmats", "Ks", "near", "far", "image_cloud"):
             getattr(own, name).copy_(getattr(cameras, name))
 
-    def _results(self) -> Predicted:
+    def _results(self) -> Prediction:
         """The results with the step numbers of the state that was given."""
         later = {s: given - own for s, given, own in zip(self._table.scenes, self._tables.steps, self._table.steps)}
         steps = []
@@ -432,14 +440,14 @@ class CapturedRollout:
         renderings = self._predicted.renderings
         if self._copies:
             renderings = [Rendering(*(x if x is None else x.clone() for x in image)) for image in renderings]
-        return Predicted(steps, list(renderings))
+        return Prediction(steps, list(renderings))
 
 
-class _Rest(NamedTuple):
-    """What rests during the rollouts of a graph, in the graph's own memory."""
+class _Frozen(NamedTuple):
+    """Frozen particles during the rollouts of a graph, in the graph's own memory."""
 
-    parts: Partition
-    background: FrozenContext
+    partition: Partition
+    context: FrozenContext
 
 
 def _own(particles: Particles) -> Particles:
@@ -463,7 +471,7 @@ def _gaps(table: CloudTable) -> list[int | None]:
     return [b[1] - a[1] if a[0] == b[0] else None for a, b in zip(places, places[1:])]
 
 
-def with_background_as_it_is(plan: Plan) -> Plan:
+def of_prepared_state(plan: Plan) -> Plan:
     """``plan`` for a state that is prepared already."""
     if plan.spec.dynamics.background not in ("masked_out", "dynamic"):
         return plan
@@ -471,7 +479,7 @@ def with_background_as_it_is(plan: Plan) -> Plan:
     return dataclasses.replace(plan, spec=dataclasses.replace(plan.spec, dynamics=dynamics))
 
 
-def _rooms(simulator: nn.Module) -> dict[str, nn.Module]:
+def _parts_of(simulator: nn.Module) -> dict[str, nn.Module]:
     """What a rollout reads."""
     return {"dynamics": simulator.dynamics, "renderer": simulator.renderer}
 

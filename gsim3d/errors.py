@@ -43,12 +43,12 @@ class ProcessorError(ImportError):
 class CaptureError(RuntimeError):
     """Something cannot be made a CUDA graph; the message says why.
 
-    no_room: whether the GPU's memory was full.
+    out_of_memory: whether memory was lacking.
     """
 
-    def __init__(self, message: str, *, no_room: bool = False):
+    def __init__(self, message: str, *, out_of_memory: bool = False):
         super().__init__(message)
-        self.no_room = no_room
+        self.out_of_memory = out_of_memory
 
 
 class FitWarning(UserWarning):

@@ -20,14 +20,13 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from gsim3d import pretrained
 from gsim3d.cameras import Cameras, Frames, FrameSource, InputSpec
-from gsim3d.cuda_graphs import CapturedRollout
+from gsim3d.cuda_graphs import CapturedRollout, Prediction
 from gsim3d.dynamics import (
     Dynamics,
     FrozenContext,
@@ -58,18 +57,6 @@ from gsim3d.ops.raster import Rendering
 from gsim3d.presets import ModelConfig
 from gsim3d.pretrained.loading import Description, check_device, describe, is_released, with_weights
 from gsim3d.state import DYNAMIC, FROZEN, Gaussians, Particles
-
-
-class Prediction(NamedTuple):
-    """What :meth:`Simulator.predict` returns.
-
-    Attributes:
-        steps: particles of each predicted step, one cloud a scene.
-        renderings: images of each step; empty where no cameras were given.
-    """
-
-    steps: list[Particles]
-    renderings: list[Rendering]
 
 
 class Simulator(nn.Module):
@@ -323,7 +310,8 @@ class Simulator(nn.Module):
         Raises:
             InputError: an edit cannot be made, and the message names its step and operation; or ``plans`` are not as
                 many as scenes.
-        Gradients: through all steps.
+        Gradients:
+            through all steps.
         """
         if plans is not None:
             options = {"generator": generator, "on_invalid": on_invalid, "report": report, "edits": edits, "log": log}

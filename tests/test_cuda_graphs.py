@@ -9,7 +9,7 @@ import torch
 
 from gsim3d.cameras import Cameras
 from gsim3d.compat.released_model import ReleasedSimulator
-from gsim3d.cuda_graphs import Captured, CapturedRollout, collecting_nothing, has_no_room
+from gsim3d.cuda_graphs import Captured, CapturedRollout, collecting_nothing, is_out_of_memory
 from gsim3d.effects.spec import DynamicsEffects, EffectsSpec
 from gsim3d.errors import CaptureError, InputError, NumericalError
 from gsim3d.numerics.policy import StabilityConfig
@@ -206,7 +206,7 @@ def test_bad_numbers_raise_behind_a_graph(device):
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
-def test_a_graph_under_autocast_reads_the_weights_it_was_told_to(dtype, devices):
+def test_graph_under_autocast_reads_reloaded_weights(dtype, devices):
     simulator = make_simulator(devices[1], torch.float32)
     state = make_state(device=devices[1], dtype=torch.float32)
     with torch.autocast("cuda", dtype):
@@ -298,31 +298,31 @@ def test_what_waits_for_the_device_is_no_graph(devices):
     x = torch.ones(3, device=devices[1])
     with pytest.raises(CaptureError, match="Captured: .*captur") as caught:
         Captured(lambda: x.sum().item(), devices[1])
-    assert not caught.value.no_room
+    assert not caught.value.out_of_memory
     torch.cuda.synchronize()
     assert Captured(lambda: 2 * x, devices[1])().tolist() == [2, 2, 2]
 
 
-def test_what_a_gpu_has_no_room_for(devices):
+def test_what_a_gpu_is_out_of_memory_for(devices):
     with pytest.raises(CaptureError, match="out of memory") as caught:
         Captured(lambda: torch.empty(1 << 50, dtype=torch.uint8, device=devices[1]), devices[1])
-    assert caught.value.no_room
+    assert caught.value.out_of_memory
 
     def render():  # the ops have an error of their own for it
         raise MemoryError("rasterize_gaussians: there is no memory for the result")
 
     with pytest.raises(CaptureError, match="no memory for the result") as caught:
         Captured(render, devices[1])
-    assert caught.value.no_room
+    assert caught.value.out_of_memory
 
 
 def test_an_op_without_room_says_so_in_its_own_words():
     with pytest.raises(RuntimeError) as caught:
         torch.ops.gsim3d.unpool(torch.ones(1, 1), torch.tensor([0]), torch.tensor([0, 1]), 2**62)
-    assert has_no_room(caught.value) and not has_no_room(RuntimeError("another"))
+    assert is_out_of_memory(caught.value) and not is_out_of_memory(RuntimeError("another"))
 
 
-def test_graphs_that_nobody_needs_do_not_end_a_capture(devices):
+def test_collected_graphs_do_not_end_a_capture(devices):
     x, calls, before = torch.ones(3, device=devices[1]), [], gc.get_threshold()
     graphs = [Captured(lambda: 2 * x, devices[1])]
 

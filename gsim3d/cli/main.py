@@ -75,9 +75,9 @@ def _command(arguments: list[str]) -> int:
         place = error.filename or getattr(args, "out", None)
         return _fail(f"{place}: {error.strerror}" if place and error.strerror else str(error))
     except (RuntimeError, MemoryError) as error:
-        from gsim3d.cuda_graphs import has_no_room
+        from gsim3d.cuda_graphs import is_out_of_memory
 
-        if not has_no_room(error):
+        if not is_out_of_memory(error):
             raise
         return _fail(f"out of memory: {str(error).splitlines()[0][:200] if str(error) else type(error).__name__}")
     except KeyboardInterrupt:

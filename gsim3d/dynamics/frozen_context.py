@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from gsim3d import ops
 from gsim3d.ops.curve import CURVES, KernelMap, PatchTable, Pyramid, PyramidSpec, Segments, Stage, Voxels
-from gsim3d.ops.streams import MANY_STREAMS, Branches
+from gsim3d.ops.streams import MANY_STREAMS, Streams
 from gsim3d.state import Particles
 
 DEPTH = 16  # levels of the curves at stage 0, and bits of a cell along an axis
@@ -107,9 +107,9 @@ class FrozenContext:
         """What a call over moving ``particles`` is given, for each stage; nothing waits for the device."""
         scenes = row_scenes(pyramid, particles)
         rooms = list(zip(self.places, pyramid.stages, scenes, self.depths, self.curves))
-        with Branches(particles.means, MANY_STREAMS) as beside:  # many launches over few rows; none waits for another
-            patches = [beside.run(_overlap, *room) for room in rooms]
-            cells = [beside.run(_cells_of_rows, *room[:3]) for room in rooms]
+        with Streams(particles.means, MANY_STREAMS) as streams:  # many launches over few rows; none waits for another
+            patches = [streams.run(_overlap, *room) for room in rooms]
+            cells = [streams.run(_cells_of_rows, *room[:3]) for room in rooms]
         return [Reader(self, *of_stage) for of_stage in zip(cells, patches, strict=True)]
 
     def map(self, f: Callable[[Tensor, int], Tensor]) -> FrozenContext:

@@ -17,7 +17,7 @@ from torch.nn import functional as F
 
 from gsim3d.nn.layers import linear_grad_weight, rounded_weights, row_linear
 from gsim3d.ops.curve import PatchTable, Stage
-from gsim3d.ops.streams import Branches
+from gsim3d.ops.streams import Streams
 
 _ops = torch.ops.gsim3d
 _autocast = torch._C.DispatchKeySet(torch._C.DispatchKey.AutocastCUDA) | torch._C.DispatchKeySet(
@@ -25,8 +25,8 @@ _autocast = torch._C.DispatchKeySet(torch._C.DispatchKey.AutocastCUDA) | torch._
 )
 
 
-class Plan(NamedTuple):
-    """What a block is told besides tensors that have gradients."""
+class BlockInputs(NamedTuple):
+    """What a block reads besides tensors that have gradients."""
 
     stage: Stage
     patches: PatchTable
@@ -79,7 +79,7 @@ class Weights(NamedTuple):
 N_ROUNDED = 12  # of the weights are read in the dtype of the products
 
 
-class Kept(NamedTuple):
+class Saved(NamedTuple):
     """What the backward pass reads."""
 
     place: Tensor  # of the convolution
@@ -105,7 +105,7 @@ def run_block(block, x: Tensor, conv_input: Tensor, stage: Stage, row: int, keep
     beside: what else the rows read, a ``background.Reader``, without gradients only.
     """
     conv, attention, mlp, position = block.position.conv, block.attention, block.mlp, block.position
-    plan = Plan(stage, stage.patches[row], conv.kernel_size, conv.duplicates == "first", attention.heads,
+    plan = BlockInputs(stage, stage.patches[row], conv.kernel_size, conv.duplicates == "first", attention.heads,
                 block.norm1.eps, recompute)  # fmt: skip
     layers = (conv, position.linear, attention.qkv, attention.proj, mlp.fc1, mlp.fc2)
     norms = (position.norm, block.norm1, block.norm2)
@@ -131,9 +131,9 @@ class _Reads(NamedTuple):
 
 
 def _forward(
-    plan: Plan, w: Weights, x: Tensor, conv_input: Tensor, keep_attention, keep_mlp, reads: _Reads | None = None
+    plan: BlockInputs, w: Weights, x: Tensor, conv_input: Tensor, keep_attention, keep_mlp, reads: _Reads | None = None
 ):
-    """(sum,) or (sum, sum in the dtype of the products); Kept."""
+    """(sum,) or (sum, sum in the dtype of the products); Saved."""
     place = _ops.sparse_conv.default(conv_input, w.conv, w.conv_bias, *plan.geometry(), plan.conv_plan())
     if reads is not None:
         place = reads.beside.convolved(reads.conv, conv_input, place)
@@ -155,7 +155,7 @@ def _forward(
         out = (sum2 + (branch if keep_mlp is None else branch * keep_mlp),)
     else:
         out = _ops.residual_norm.default(sum2, branch, keep_mlp, None, None, None, None, plan.eps)[:2]
-    return out, Kept(place, position, sum1, normed1, position_stats, stats1, qkv, attended, attention_stats, sum2,
+    return out, Saved(place, position, sum1, normed1, position_stats, stats1, qkv, attended, attention_stats, sum2,
                      normed2, stats2, hidden, activated)  # fmt: skip
 
 
@@ -163,41 +163,50 @@ def _heads(qkv: Tensor, heads: int) -> tuple[Tensor, ...]:
     return qkv.view(qkv.shape[0], 3, heads, qkv.shape[1] // (3 * heads)).unbind(1)
 
 
-def _backward(plan: Plan, w: Weights, kept: Kept, conv_input: Tensor, keep_attention, keep_mlp, grad_sum, grad_out,
-              beside: Branches):  # fmt: skip
-    """Gradients of x, conv_input and all weights, in their order; those of weights of layers are made ``beside``."""
+def _backward(
+    plan: BlockInputs,
+    w: Weights,
+    kept: Saved,
+    conv_input: Tensor,
+    keep_attention,
+    keep_mlp,
+    grad_sum,
+    grad_out,
+    streams,
+):
+    """Gradients of x, conv_input and all weights, in their order; those of weights of layers run in ``streams``."""
     # Without a norm of the branch the op reads only the dtype of the branch: any tensor like it will do.
     grad2, grad_branch, fc2_bias, *_ = _ops.residual_norm_backward.default(
         grad_sum, grad_out, kept.normed2, kept.sum2, keep_mlp, None, None, kept.stats2[:0], kept.stats2[:0]
     )
-    fc2 = beside.run(linear_grad_weight, grad_branch, kept.activated)
+    fc2 = streams.run(linear_grad_weight, grad_branch, kept.activated)
     grad_activated = grad_branch @ w.fc2
     zero, one = _zeros_and_ones(w.fc1.shape[0], grad2.dtype, grad2.device)
     grad_hidden, _, fc1_bias = _ops.norm_gelu_backward.default(grad_activated, kept.hidden, zero, one, zero)
-    fc1 = beside.run(linear_grad_weight, grad_hidden, kept.normed2)
+    fc1 = streams.run(linear_grad_weight, grad_hidden, kept.normed2)
     grad_normed = grad_hidden @ w.fc1
 
     grad1, grad_branch, proj_bias, _, _, norm2, norm2_bias = _ops.residual_norm_backward.default(
         grad2, grad_normed, kept.normed2, kept.sum2, keep_attention, None, w.norm2, kept.stats2[:0], kept.stats2
     )
-    proj = beside.run(linear_grad_weight, grad_branch, kept.attended.flatten(1))
+    proj = streams.run(linear_grad_weight, grad_branch, kept.attended.flatten(1))
     grad_attended = grad_branch @ w.proj
     q, k, v = _heads(kept.qkv, plan.heads)
     grad_qkv = _ops.patch_attention_backward_packed.default(
         grad_attended.view(q.shape), q, k, v, kept.attended, kept.attention_stats, *plan.table(), q.shape[-1] ** -0.5
     ).flatten(1)
-    qkv = beside.run(linear_grad_weight, grad_qkv, kept.normed1)
-    qkv_bias = beside.run(_ops.linear_grad_bias.default, grad_qkv)
+    qkv = streams.run(linear_grad_weight, grad_qkv, kept.normed1)
+    qkv_bias = streams.run(_ops.linear_grad_bias.default, grad_qkv)
     grad_normed = grad_qkv @ w.qkv
 
     grad_x, grad_position, linear_bias, *of_norms = _ops.residual_norm_backward.default(
         grad1, grad_normed, kept.position, kept.sum1, None, w.position_norm, w.norm1, kept.position_stats, kept.stats1
     )
     grad_place = grad_position @ w.linear
-    conv, conv_bias = beside.run(
+    conv, conv_bias = streams.run(
         _ops.sparse_conv_grad_weight.default, grad_place, conv_input, plan.kernel_size, *plan.geometry()
     )
-    linear = beside.run(linear_grad_weight, grad_position, kept.place)
+    linear = streams.run(linear_grad_weight, grad_position, kept.place)
     grad_input = _ops.sparse_conv_grad_input.default(grad_place, w.conv, *plan.geometry(), plan.conv_plan())
     of_layers = conv, conv_bias, linear, linear_bias, qkv, qkv_bias, proj, proj_bias, fc1, fc1_bias, fc2
     return grad_x, grad_input, *of_layers, fc2_bias, *of_norms, norm2, norm2_bias
@@ -228,8 +237,8 @@ class _Block(torch.autograd.Function):
             if ctx.plan.recompute:
                 kept = _forward(ctx.plan, ctx.weights, x, conv_input, keep_attention, keep_mlp)[1]
             else:
-                kept = Kept(*saved[: len(Kept._fields)])
+                kept = Saved(*saved[: len(Saved._fields)])
             keeps = keep_attention, keep_mlp
-            with Branches(conv_input) as beside:
-                grads = _backward(ctx.plan, ctx.weights, kept, conv_input, *keeps, grad_sum, grad_out, beside)
+            with Streams(conv_input) as streams:
+                grads = _backward(ctx.plan, ctx.weights, kept, conv_input, *keeps, grad_sum, grad_out, streams)
         return None, None, *grads[:2], None, None, *grads[2:]

@@ -33,11 +33,13 @@ NEAR_PLANE = 0.01  # metres; what is nearer to a camera is not drawn
 class RendererConfig:
     """How particles become Gaussians.
 
-    latents: channels of dynamic and static latents together; 0 for explicit particles, whose head has no weights.
-    sh_degree: 0 to 3, of the view-dependent colour.
-    scale_min, scale_max: metres, limits of predicted scales.
-    initial_scale: metres, scale that an untrained head predicts; None: the middle of the limits.
-    jacobian: "exact", or "clamped" of models that were trained so; as of :func:`gsim3d.ops.rasterize_gaussians`.
+    Attributes:
+        latents: channels of dynamic and static latents together; 0 for explicit particles, whose head has no weights.
+        sh_degree: 0 to 3, of the view-dependent colour.
+        scale_min: metres, lower limit of predicted scales.
+        scale_max: metres, upper limit.
+        initial_scale: metres, scale that an untrained head predicts; None: the middle of the limits.
+        jacobian: "exact", or "clamped" of models that were trained so; see :func:`gsim3d.ops.rasterize_gaussians`.
     """
 
     latents: int = 64

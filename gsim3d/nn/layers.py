@@ -17,7 +17,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from gsim3d.ops import norm_gelu, row_norm
-from gsim3d.ops.streams import Branches
+from gsim3d.ops.streams import Streams
 
 MIN_ROWS = 16  # matrix products of fewer rows go through other code in BLAS, which rounds differently
 
@@ -87,9 +87,9 @@ class _RowLinear(torch.autograd.Function):
     def backward(ctx, grad):
         x, _ = ctx.saved_tensors
         grad = grad.contiguous()
-        with Branches(grad) as beside:
-            weight = beside.run(linear_grad_weight, grad, x)
-            bias = beside.run(torch.ops.gsim3d.linear_grad_bias, grad)
+        with Streams(grad) as streams:
+            weight = streams.run(linear_grad_weight, grad, x)
+            bias = streams.run(torch.ops.gsim3d.linear_grad_bias, grad)
             grad_x = grad @ ctx.rounded_weight
         return grad_x, weight, bias, None, None
 
@@ -113,15 +113,15 @@ def rounded_weights(module: nn.Module, dtype: torch.dtype) -> tuple[Tensor | Non
     return weight, bias[0] if bias else None
 
 
-def round_at_once(modules: Sequence[nn.Module], dtype: torch.dtype) -> dict[int, Sequence[Tensor]]:
+def round_weights(modules: Sequence[nn.Module], dtype: torch.dtype) -> dict[int, Sequence[Tensor]]:
     """The :func:`rounded_weights` of ``modules``, made in a few launches, not two a layer."""
     modules = [module for module in modules if module.weight.dtype != dtype]
     return dict(zip(map(id, modules), _rounded(modules, dtype), strict=True))
 
 
 @contextlib.contextmanager
-def at_hand(rounded: dict[int, Sequence[Tensor]]):
-    """A context in which :func:`rounded_weights` returns what :func:`round_at_once` has made."""
+def use_rounded(rounded: dict[int, Sequence[Tensor]]):
+    """A context in which :func:`rounded_weights` returns what :func:`round_weights` has made."""
     token = _ready.set(rounded)
     try:
         yield
@@ -330,7 +330,7 @@ def make_norm(kind: str, channels: int) -> nn.Module:
 def tf32_only_if_asked():
     """A context in which a GPU's float32 convolutions use TF32 only if matrix products may.
 
-    Torch has a switch for each, and that of convolutions is on unless somebody turns it off. How TF32 rounds depends on
+    Torch has a switch for each, and that of convolutions is on unless it is turned off. How TF32 rounds depends on
     the algorithm, which cuDNN chooses by the number of images: a scene would differ from itself in a larger batch.
     """
     products, cudnn = torch.backends.cuda.matmul, torch.backends.cudnn

@@ -22,17 +22,17 @@ from gsim3d.nn.fused_block import run_block
 from gsim3d.nn.layers import (
     RowLayerNorm,
     RowLinear,
-    at_hand,
     make_norm,
     product_dtype,
-    round_at_once,
+    round_weights,
     rounded_linear,
     rounded_weights,
     row_linear,
+    use_rounded,
     widened,
 )
 from gsim3d.ops.curve import PatchTable, Pyramid, PyramidSpec, Stage
-from gsim3d.ops.streams import Branches
+from gsim3d.ops.streams import Streams
 
 STEM_KERNEL, BLOCK_KERNEL = 5, 3  # edges of the convolutions, in cells
 MAX_HISTORY_BITS = 32  # that the geometry counts
@@ -49,7 +49,7 @@ class TransformerConfig:
         history_bits: a history has 1 to 2^history_bits steps.
         strides, merge_windows: S - 1 powers of two: how much coarser the next level is, how many steps it merges.
         patch_sizes: particles that attend to each other.
-        time_embedding: merged steps are told apart by a learned vector.
+        time_embedding: a learned vector distinguishes merged steps.
         encoder_depths, encoder_channels, encoder_heads: S each.
         decoder_depths, decoder_channels, decoder_heads: S - 1 each, levels 0 to S - 2.
         mlp_ratio: hidden channels of a block's MLP over its channels.
@@ -302,7 +302,7 @@ class Block(nn.Module):
         return x + scaled(self.mlp(self.norm2(x)), keep_mlp)
 
     def _draw_keep(self, x: Tensor, generator: torch.Generator | None) -> list[Tensor | None]:
-        """Of both branches [N, 1]: 0 for rows that skip it, 1 / share kept for the others; None: nobody skips.
+        """Of both branches [N, 1]: 0 for particles that skip it, 1 / (1 - drop_path) for the others; None: none skips.
 
         Drawn before anything is computed: a generator does not repeat itself when the block is computed again.
         """
@@ -530,22 +530,22 @@ class PointTransformer(nn.Module):
         if not x.is_cuda or torch.compiler.is_compiling():
             x = self.stem(x, pyramid.stages[0], contexts[0])
             return self._behind_stem(x, pyramid, generator, contexts)
-        with Branches(x) as branches:
-            rounded = branches.run(round_at_once, self._products, product_dtype(x))
+        with Streams(x) as streams:
+            rounded = streams.run(round_weights, self._products, product_dtype(x))
             x = self.stem(x, pyramid.stages[0], contexts[0])
-        with at_hand(rounded):
+        with use_rounded(rounded):
             return self._behind_stem(x, pyramid, generator, contexts)
 
     def _behind_stem(
         self, x: Tensor, pyramid: Pyramid, generator: torch.Generator | None, contexts: Sequence[FrozenContext | None]
     ) -> Tensor:
         stages, skips = pyramid.stages, []
-        with Branches(x) as branches:
+        with Streams(x) as streams:
             for s, (encoder, stage, context) in enumerate(zip(self.encoder, stages, contexts, strict=True)):
                 x = encoder(x, stage, generator, context)
                 if s < len(self.decoder):  # made beside the deeper stages
                     lift = self.decoder[s].unpool.lift
-                    skips.append(lift(x, stage) if torch.is_grad_enabled() else branches.run(lift, x, stage))
+                    skips.append(lift(x, stage) if torch.is_grad_enabled() else streams.run(lift, x, stage))
         for s in reversed(range(len(self.decoder))):
             x = self.decoder[s](x, skips[s], stages[s], stages[s + 1], generator, contexts[s])
         return x

@@ -23,7 +23,10 @@ def row_scenes(cloud_scene: Tensor, cu_input: Tensor, stages: Sequence[Segments]
         stages: at most 8; the rows of the stage before, first of the input, that each row pools.
     Returns:
         int64 [M] for each stage; 0 for rows that pool none.
-    Gradients: none. Determinism: integers.
+    Gradients:
+        none.
+    Determinism:
+        integers.
     Raises:
         ValueError, TypeError: a shape, a dtype or a device does not fit; the message names the argument.
 
@@ -47,7 +50,10 @@ def find_cells(cells: Tensor, scene: Tensor, grid: Tensor) -> Tensor:
         grid: int64 [N, 3], in [0, 2^16).
     Returns:
         int64 [N], D - 1 for rows whose cell is not in the list.
-    Gradients: none. Determinism: integers.
+    Gradients:
+        none.
+    Determinism:
+        integers.
     Raises:
         ValueError, TypeError: a shape, a dtype or a device does not fit; the message names the argument.
 
@@ -71,7 +77,8 @@ def add_cells(x: Tensor, field: Tensor, places: Tensor, *, check: bool = True) -
         check: look for numbers that cannot be used, on the CPU; a model that guards its numbers itself leaves it out.
     Returns:
         [N, C], dtype of ``x``.
-    Gradients: ``x`` and ``field``, once; sums over the rows of a cell have one order.
+    Gradients:
+        ``x`` and ``field``, once; sums over the rows of a cell have one order.
     Raises:
         NumericalError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
         ValueError, TypeError: an argument is malformed; the message names it.
@@ -106,7 +113,10 @@ def overlapping_patches(
         patch_size: at least 1.
     Returns:
         One table a curve, of P + N // patch_size patches. A row of a scene without patches is in none.
-    Gradients: none. Determinism: integers.
+    Gradients:
+        none.
+    Determinism:
+        integers.
     Raises:
         ValueError, TypeError: a shape, a dtype, a device or, on the CPU, an entry does not fit; the message names the
             argument.

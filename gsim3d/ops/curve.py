@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsim3d.ops._arguments import check_real, check_tensors, check_whole
 from gsim3d.ops._register import fake
-from gsim3d.ops.streams import MANY_STREAMS, Branches
+from gsim3d.ops.streams import MANY_STREAMS, Streams
 
 CURVES = ("z", "z-trans", "hilbert", "hilbert-trans")
 
@@ -34,10 +34,14 @@ def curve_encode(
         shift: position of the cloud's lowest bit, 3 depth to 62; default 3 depth.
     Returns:
         int64 [N], or [R, N] for R curves. On CUDA a row whose cell or cloud is out of range has code 0.
-    Gradients: none. Determinism: integers.
+    Gradients:
+        none.
+    Determinism:
+        integers.
     Raises:
         ValueError: depth or shift is out of range or, on the CPU, a cell or a cloud; the message names row and axis.
-    Source: Morton order; Skilling, "Programming the Hilbert curve" (2004).
+    Source:
+        Morton order; Skilling, "Programming the Hilbert curve" (2004).
 
     Example:
         >>> curve_encode(torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1]]), None, "z")
@@ -70,7 +74,10 @@ def curve_sort(codes: Tensor) -> tuple[Tensor, Tensor]:
         codes: int64 [R, N], N below 2^32.
     Returns:
         order, inverse: int64 [R, N]; on CUDA N is below 2^30.
-    Gradients: none. Determinism: integers.
+    Gradients:
+        none.
+    Determinism:
+        integers.
 
     Example:
         >>> curve_sort(torch.tensor([[30, 10, 20]]))
@@ -360,11 +367,15 @@ def build_pyramid(
     Returns:
         Pyramid; tensors int64 on the device of ``positions``. On CUDA the call waits once, for the sizes; with
         ``capacity`` never: a CUDA graph can capture it, and ``Pyramid.found`` tells later whether the data fitted.
-    Gradients: none. Determinism: integers. The order of the rows of a cloud permutes the results only.
+    Gradients:
+        none.
+    Determinism:
+        integers. The order of the rows of a cloud permutes the results only.
     Raises:
         ValueError: an argument is malformed; the message names it. With ``capacity`` on CUDA, malformed clouds give an
             empty pyramid instead, see :meth:`PyramidCapacity.fits`.
-    Source: grid pooling and serialization of Point Transformer V3 (Wu et al. 2024), time merging of 3DGSim.
+    Source:
+        grid pooling and serialization of Point Transformer V3 (Wu et al. 2024), time merging of 3DGSim.
 
     Example:
         >>> spec = PyramidSpec(0.1, 0, (2,), (1,), (8, 8), ((3,), (3,)))
@@ -411,7 +422,7 @@ def build_pyramid(
     if rounded and not torch.compiler.is_compiling():
         each = len(PyramidCapacity.COUNTS)
         counts = arrays[-1].tolist()[1 : 1 + each * spec.n_stages : each]
-    with Branches(positions, MANY_STREAMS) as streams:
+    with Streams(positions, MANY_STREAMS) as streams:
         return _assemble(arrays, spec, counts, capacity is not None or rounded, streams)
 
 
@@ -438,7 +449,7 @@ def _check_whole_numbers(name: str, values: tuple[int, ...]) -> None:
         check_whole("build_pyramid", **{name: value})
 
 
-def _kernel_map(size: int, voxels: Voxels, taps: tuple[Tensor, Tensor, Tensor], streams: Branches) -> KernelMap:
+def _kernel_map(size: int, voxels: Voxels, taps: tuple[Tensor, Tensor, Tensor], streams: Streams) -> KernelMap:
     """Larger kernels have one convolution a network call and tables of K^3 entries a row: no plan is kept."""
     plan = None
     if taps[0].is_cuda and size == 3:
@@ -448,7 +459,7 @@ def _kernel_map(size: int, voxels: Voxels, taps: tuple[Tensor, Tensor, Tensor], 
 
 
 def _assemble(
-    arrays: list[Tensor], spec: PyramidSpec, counts: list[int] | None, has_found: bool, streams: Branches
+    arrays: list[Tensor], spec: PyramidSpec, counts: list[int] | None, has_found: bool, streams: Streams
 ) -> Pyramid:
     """Names the flat results, in the order that csrc/gsim3d/curve/pyramid.h states. ``counts``: rows of data of each
     stage, where that is not all and the host knows it."""

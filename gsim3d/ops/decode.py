@@ -27,7 +27,8 @@ def decode_gaussians(
         check: look for numbers that cannot be used, on the CPU; a model that guards its numbers itself leaves it out.
     Returns:
         quats [N, 4] (w, x, y, z), scales [N, 3], sh [N, (degree + 1)^2, 3]; float32, float64 with float64 rows.
-    Gradients: ``raw``, once.
+    Gradients:
+        ``raw``, once.
     Raises:
         NumericalError: a number is not finite or beyond 1e15 (float64: 1e150; readings: 1e3); CPU only.
         ValueError, TypeError: an argument is malformed; the message names it.

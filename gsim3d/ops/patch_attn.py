@@ -28,14 +28,17 @@ def patch_attention(
         check: look for numbers that cannot be used, on the CPU; a model that guards its numbers itself leaves it out.
     Returns:
         [Nq, H, D], dtype of ``q``.
-    Gradients: ``q``, ``k`` and ``v``, once.
-    Determinism: equal bits for any number of threads, with AVX2 and AVX-512, on one GPU in every run, for any numbering
+    Gradients:
+        ``q``, ``k`` and ``v``, once.
+    Determinism:
+        equal bits for any number of threads, with AVX2 and AVX-512, on one GPU in every run, for any numbering
         of the rows, and with any other patches beside; only the order of the keys inside a patch rounds differently.
     Raises:
         NumericalError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
         ValueError, TypeError: a shape, dtype, head dim, scale or table is malformed; the message names the argument.
             CUDA does not look into the table: rows out of range take no part.
-    Source: Dao et al. 2022 (FlashAttention), applied to the patches of Point Transformer V3 (Wu et al. 2024).
+    Source:
+        Dao et al. 2022 (FlashAttention), applied to the patches of Point Transformer V3 (Wu et al. 2024).
 
     Example:
         >>> from gsim3d.ops import PatchTable
@@ -77,7 +80,8 @@ def joint_attention(
         scale, check: as in :func:`patch_attention`.
     Returns:
         [Nq, H, D], dtype of ``q``; 0 for a query row without keys.
-    Gradients: ``q``, keys and values, once.
+    Gradients:
+        ``q``, keys and values, once.
     Determinism, Raises: as :func:`patch_attention`. In 16 bits the result over the first table is rounded before the
         other joins it.
 

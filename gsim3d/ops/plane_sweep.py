@@ -25,7 +25,8 @@ def sweep_geometry(
         Ks_target: [P, 3, 3], intrinsics that project into the source of each pair; default: those of the source.
     Returns:
         homographies [P, 3, 3] and translations [P, 3] (metres), dtype of ``Ks``.
-    Gradients: none.
+    Gradients:
+        none.
     Raises:
         NumericalError: a matrix is not finite or cannot be inverted; CPU only.
         ValueError, TypeError: an argument has a wrong shape, dtype or range; the message names it.
@@ -110,13 +111,16 @@ def plane_sweep(
         check: look for numbers that cannot be used, on the CPU; a model that guards its numbers itself leaves it out.
     Returns:
         [I, D, h, w], dtype of ``features``.
-    Gradients: ``features``, once.
-    Determinism: every output and gradient element has one owner that sums in a fixed order.
+    Gradients:
+        ``features``, once.
+    Determinism:
+        every output and gradient element has one owner that sums in a fixed order.
     Raises:
         NumericalError: a feature is not finite or beyond 1e15 (float64: 1e150); CPU only.
         ValueError, TypeError: an argument has a wrong shape, dtype or range, or geometry is not finite; the message
             names it. On CUDA values are not looked at: a source out of range sees nothing.
-    Source: plane sweep of Collins (1996) as in MVSplat (Chen et al. 2024), with dot products interpolated.
+    Source:
+        plane sweep of Collins (1996) as in MVSplat (Chen et al. 2024), with dot products interpolated.
 
     Example:
         >>> A, b = sweep_geometry(torch.eye(3).expand(2, 3, 3), torch.eye(4).expand(2, 4, 4),

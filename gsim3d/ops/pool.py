@@ -19,12 +19,14 @@ def pool_max(x: Tensor, rows: Tensor, cu_rows: Tensor, *, check: bool = True) ->
         check: look for numbers that cannot be used, on the CPU; a model that guards its numbers itself leaves it out.
     Returns:
         [M, C], dtype of ``x``.
-    Gradients: ``x``, once; of equal maxima the one listed first receives it.
+    Gradients:
+        ``x``, once; of equal maxima the one listed first receives it.
     Raises:
         NumericalError: a number of ``x`` is not finite or beyond 1e15 (float64: 1e150); CPU only.
         ValueError, TypeError: an argument is malformed; the message names it. CUDA does not look into the index lists:
             rows out of range take no part.
-    Source: grid pooling of Point Transformer V2/V3 (Wu et al. 2022, 2024).
+    Source:
+        grid pooling of Point Transformer V2/V3 (Wu et al. 2022, 2024).
 
     Example:
         >>> x = torch.tensor([[1.0], [5.0], [3.0]])
@@ -48,7 +50,8 @@ def pool_mean(x: Tensor, rows: Tensor, cu_rows: Tensor, *, check: bool = True) -
         check: as in :func:`pool_max`.
     Returns:
         [M, C], dtype of ``x``.
-    Gradients: ``x``, once.
+    Gradients:
+        ``x``, once.
     Raises:
         NumericalError, ValueError, TypeError: as :func:`pool_max`.
 
@@ -71,7 +74,8 @@ def unpool(x: Tensor, rows: Tensor, cu_rows: Tensor, n_rows: int, *, check: bool
         n_rows: N, rows of the result.
     Returns:
         [N, C]; rows that no segment lists are 0.
-    Gradients: ``x``, once; summed in the order of ``rows``, so equal bits for any number of threads.
+    Gradients:
+        ``x``, once; summed in the order of ``rows``, so equal bits for any number of threads.
 
     Example:
         >>> unpool(torch.tensor([[7.0]]), torch.tensor([1, 0]), torch.tensor([0, 2]), 3)

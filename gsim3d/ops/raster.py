@@ -94,10 +94,12 @@ def rasterize_gaussians(
             does not count.
     Returns:
         Rendering, dtype of ``means``.
-    Gradients: means, quats, scales, opacities, sh or colors, features, background, ``cameras.viewmats`` (its 12 upper
+    Gradients:
+        means, quats, scales, opacities, sh or colors, features, background, ``cameras.viewmats`` (its 12 upper
         entries taken as free numbers); once. A Gaussian gets none from a pixel where its alpha is cut to 0.99, and its
         colour none where it was clamped at 0.
-    Determinism: equal bits for any number of threads, forward and backward; on a GPU from run to run.
+    Determinism:
+        equal bits for any number of threads, forward and backward; on a GPU from run to run.
     GPU: nothing waits for the device. Its memory is made for Gaussians of a few pixels and clouds shown by equally many
         images; what exceeds it is rendered in further groups of images, slower.
     Raises:
@@ -106,7 +108,8 @@ def rasterize_gaussians(
             and camera.
         ValueError: a shape, dtype, offset or camera is not as above. On a GPU an image whose camera or cloud is not
             shows its background, and a background that is not finite is black.
-    Source: Zwicker et al. 2002 (EWA splatting), Kerbl et al. 2023 (3D Gaussian splatting); conventions of gsplat.
+    Source:
+        Zwicker et al. 2002 (EWA splatting), Kerbl et al. 2023 (3D Gaussian splatting); conventions of gsplat.
 
     Example:
         >>> from gsim3d.cameras import Cameras

@@ -30,11 +30,13 @@ def row_norm(
     Returns:
         [N, C], dtype of ``residual``, else of ``x``. Under ``torch.autocast`` CUDA returns autocast's dtype where there
         is no residual, ready for the matrix product that follows; the CPU computes in float32.
-    Gradients: ``x``, ``weight``, ``bias``, ``residual``, once; sums over rows have one order.
+    Gradients:
+        ``x``, ``weight``, ``bias``, ``residual``, once; sums over rows have one order.
     Raises:
         NumericalError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
         ValueError, TypeError: an argument is malformed; the message names it.
-    Source: Ba et al. 2016, Layer Normalization.
+    Source:
+        Ba et al. 2016, Layer Normalization.
 
     Example:
         >>> row_norm(torch.tensor([[1.0, 3.0]]), torch.ones(2), torch.zeros(2), torch.ones(1, 2)).round(decimals=3)
@@ -74,7 +76,8 @@ def residual_norm(
         eps, check: as in :func:`row_norm`.
     Returns:
         sum [N, C], dtype of ``x``; out [N, C], dtype of ``branch``.
-    Gradients: ``x``, ``branch``, weights and biases, once; sums over rows have one order.
+    Gradients:
+        ``x``, ``branch``, weights and biases, once; sums over rows have one order.
     Raises:
         NumericalError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
         ValueError, TypeError: an argument is malformed; the message names it.
@@ -187,11 +190,13 @@ def norm_gelu(x: Tensor, mean: Tensor, scale: Tensor, bias: Tensor, *, check: bo
         check: as in :func:`row_norm`.
     Returns:
         [N, C], float32; float64 with float64 rows.
-    Gradients: all arguments, once; sums over rows have one order.
+    Gradients:
+        all arguments, once; sums over rows have one order.
     Raises:
         NumericalError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
         ValueError, TypeError: an argument is malformed; the message names it.
-    Source: Ioffe & Szegedy 2015, Batch Normalization; Hendrycks & Gimpel 2016, GELU (the exact one).
+    Source:
+        Ioffe & Szegedy 2015, Batch Normalization; Hendrycks & Gimpel 2016, GELU (the exact one).
 
     Example:
         >>> norm_gelu(torch.tensor([[3.0]]), torch.tensor([1.0]), torch.tensor([0.5]), torch.zeros(1)).round(decimals=3)

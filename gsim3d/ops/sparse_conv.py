@@ -37,14 +37,17 @@ def sparse_conv(
         check: look for numbers that cannot be used, on the CPU; a model that guards its numbers itself leaves it out.
     Returns:
         [N, C_out], dtype of ``x``.
-    Gradients: ``x``, ``weight``, ``bias``, once.
-    Determinism: the same bits for any number of threads, and in every run on CUDA. On the CPU an output is one chain of
+    Gradients:
+        ``x``, ``weight``, ``bias``, once.
+    Determinism:
+        the same bits for any number of threads, and in every run on CUDA. On the CPU an output is one chain of
         sums in the order of taps.
     Raises:
         NumericalError: a number is not finite or beyond 1e15 (float64: 1e150); CPU only.
         ValueError, TypeError: shapes, dtypes, ``voxels`` or ``kernel_map`` are malformed; the message names it.
             CUDA does not look into the index lists: pairs and rows out of range take no part, rows not listed are 0.
-    Source: Graham et al., "3D semantic segmentation with submanifold sparse convolutional networks", 2018.
+    Source:
+        Graham et al., "3D semantic segmentation with submanifold sparse convolutional networks", 2018.
 
     Example, two rows in one voxel and no neighbours:
         >>> from gsim3d.ops import KernelMap, Voxels

@@ -1,6 +1,6 @@
-"""Branches of a CUDA graph: work that nobody waits for until its results are needed.
+"""Parallel streams of a CUDA graph: work whose results are needed later runs beside what follows it.
 
-Kernels over few rows leave most of a GPU idle. In a graph, those of a branch run beside those that follow it.
+Kernels over few rows leave most of a GPU idle. In a graph, those of a stream run beside those that follow them.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ N_STREAMS = 4  # what more branches than these are given is queued behind one of
 MANY_STREAMS = 8
 
 
-class Branches:
+class Streams:
     """A context; what is run in it is done when the context is left, and may be read only then.
 
     While a graph is captured, :meth:`run` makes nodes that wait for the work before them, not the other way round.
@@ -32,7 +32,7 @@ class Branches:
         self._streams = _streams(like.device)[:n_streams] if captured else ()
         self._count, self._read = 0, []
 
-    def __enter__(self) -> Branches:
+    def __enter__(self) -> Streams:
         return self
 
     def run(self, function: Callable[..., Any], *arguments: Any) -> Any:

@@ -99,8 +99,10 @@ def validate_state(
         check: check the types of the arguments; a model that makes them itself leaves it out.
     Returns:
         Status, record and sanitized rows, on the device of the rows.
-    Gradients: none; fields that ask for one are refused where rows are sanitized.
-    Determinism: equal bits for any number of threads; on a GPU in every run.
+    Gradients:
+        none; fields that ask for one are refused where rows are sanitized.
+    Determinism:
+        equal bits for any number of threads; on a GPU in every run.
     Raises:
         ValueError, TypeError: an argument is malformed; the message names it. On a GPU offsets are not checked.
 

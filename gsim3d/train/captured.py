@@ -23,7 +23,7 @@ import torch
 from torch import Tensor, nn
 
 from gsim3d.cameras import Frames
-from gsim3d.cuda_graphs import Captured, with_background_as_it_is
+from gsim3d.cuda_graphs import Captured, of_prepared_state
 from gsim3d.dynamics import DynamicsConfig, concatenate
 from gsim3d.effects.plan import Plan
 from gsim3d.errors import CaptureError, InputError
@@ -163,13 +163,13 @@ class CapturedLoss:
             try:
                 return Captured(function, device, self._pool)
             except CaptureError as error:
-                if not error.no_room:
+                if not error.out_of_memory:
                     raise
                 if is_last:
                     raise CaptureError(
                         f"captured: {error}; lower batch, target_views or horizon of the phase, or set captured: false "
                         "and recompute: [encoder, steps]",
-                        no_room=True,
+                        out_of_memory=True,
                     ) from error
             # Not while the error is handled: it holds all that did not fit.
             self._steps = {kind: other for kind, other in self._steps.items() if other is step}
@@ -274,7 +274,7 @@ class _Step:
         if not self._n_future:
             return []
         if plan.spec.dynamics.background == "masked_out":
-            state, plan = _without_background(state), with_background_as_it_is(plan)
+            state, plan = _without_background(state), of_prepared_state(plan)
         else:
             state = owner.simulator._prepare(state, plan)
         rollout = partial(owner.simulator.rollout, plan=plan, geometry=geometry, report=report, on_invalid="drop")

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 
-from gsim3d.cuda_graphs import has_no_room
+from gsim3d.cuda_graphs import is_out_of_memory
 from gsim3d.data import Scene
 from gsim3d.errors import InputError
 from gsim3d.io import checkpoint
@@ -57,7 +57,7 @@ def train(
         try:
             trainer.run(until=until, tensorboard=tensorboard, profile=profile)
         except (RuntimeError, MemoryError) as error:
-            if not has_no_room(error):
+            if not is_out_of_memory(error):
                 raise
             raise InputError(
                 f"step {trainer.step}: out of memory ({device}): a smaller batch or fewer target_views, larger strides "

@@ -237,7 +237,7 @@ def test_a_wrong_setting_is_named(capsys, work, tmp_path):
 
 def test_out_of_memory_is_one_line(capsys, work, tmp_path, monkeypatch):
     def full(*args, **options):
-        raise CaptureError("captured: no room;\nlower batch", no_room=True)
+        raise CaptureError("captured: no room;\nlower batch", out_of_memory=True)
 
     monkeypatch.setattr("gsim3d.train.loop.Trainer.run", full)
     (tmp_path / "config.yaml").write_text(TRAINING)

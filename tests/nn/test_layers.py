@@ -9,12 +9,12 @@ from gsim3d.nn.layers import (
     RowLinear,
     _combine,
     _statistics,
-    at_hand,
     exact_convolutions,
     product_dtype,
-    round_at_once,
+    round_weights,
     rounded_weights,
     tf32_only_if_asked,
+    use_rounded,
 )
 from gsim3d.train.loop import deterministic
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, with_threads
@@ -116,7 +116,7 @@ def test_weights_are_rounded_at_once(device, monkeypatch):
     calls, copy = [], torch._foreach_copy_
     monkeypatch.setattr(torch, "_foreach_copy_", lambda to, of: (calls.append(len(to)), copy(to, of)))
     for expected in ([3], [3, 3]):
-        with at_hand(round_at_once(layers, torch.bfloat16)):
+        with use_rounded(round_weights(layers, torch.bfloat16)):
             for layer in layers:
                 weight, bias = rounded_weights(layer, torch.bfloat16)
                 assert_same_bits(weight, layer.weight.detach().bfloat16())
@@ -125,7 +125,7 @@ def test_weights_are_rounded_at_once(device, monkeypatch):
         with torch.no_grad():
             layers[0].weight.mul_(2), layers[1].weight.mul_(2), layers[0].bias.add_(1)
     assert_same_bits(rounded_weights(layers[0], torch.bfloat16)[0], layers[0].weight.detach().bfloat16())
-    with at_hand(round_at_once(layers, torch.float32)):
+    with use_rounded(round_weights(layers, torch.float32)):
         assert rounded_weights(layers[0], torch.float32)[0] is layers[0].weight
 
 
@@ -203,7 +203,7 @@ def test_layers_under_autocast_err_no_more_than_torchs(dtype, devices):
 @pytest.mark.parametrize("context", [tf32_only_if_asked, deterministic])
 def test_convolutions_use_tf32_only_if_asked(context):
     cudnn = torch.backends.cudnn
-    assert cudnn.conv.fp32_precision == "tf32"  # which torch chooses, and nobody asked for
+    assert cudnn.conv.fp32_precision == "tf32"  # torch's default
     for inner in (tf32_only_if_asked, exact_convolutions):
         with context(), inner():
             assert cudnn.conv.fp32_precision != "tf32"

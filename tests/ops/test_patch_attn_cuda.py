@@ -1,4 +1,4 @@
-"""patch_attention on CUDA alone: 16-bit numbers, tables nobody checked, graphs, autocast."""
+"""patch_attention on CUDA alone: 16-bit numbers, unchecked tables, graphs, autocast."""
 
 import dataclasses
 

@@ -93,7 +93,7 @@ def test_what_does_not_fit_leaves_nothing(device):
     assert grown.sizes[0] == 151 and grown.sizes[1] == math.ceil(2.5 * exact.stages[0].n_clouds)
 
 
-def test_malformed_clouds_of_given_sizes_are_told_later(devices):
+def test_malformed_clouds_of_given_sizes_are_reported_later(devices):
     arguments = scene() | {"cloud_slot": torch.tensor([0, 1, 2, 3, 2, 2, 3])}
     capacity = PyramidCapacity.of(build_pyramid(**scene(), spec=SPEC), 151)
     with pytest.raises(ValueError, match="cloud_slot must differ"):

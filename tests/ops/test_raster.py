@@ -230,7 +230,7 @@ def test_opcheck():
 
 
 def test_opcheck_on_cuda(devices):
-    # Traced and eager outputs are not compared: what is kept for the backward pass has bytes that nobody sets.
+    # Traced and eager outputs are not compared: what is kept for the backward pass has bytes that are never set.
     args = (*operator_args(random_scene(n=8, images=2, clouds=2, width=9, height=7).to(devices[1])), True)
     tests = ("test_schema", "test_autograd_registration", "test_faketensor")
     torch.library.opcheck(torch.ops.gsim3d.rasterize_gaussians, args, test_utils=tests)

@@ -1,11 +1,11 @@
-"""Branches of a CUDA graph."""
+"""Parallel streams of a CUDA graph."""
 
 import pytest
 import torch
 
 from gsim3d.cuda_graphs import Captured
 from gsim3d.errors import CaptureError
-from gsim3d.ops.streams import Branches
+from gsim3d.ops.streams import Streams
 from tests.asserts import assert_same_bits
 
 
@@ -18,10 +18,10 @@ def chain(x, weight):
 
 def chains(x, weight):
     results = []
-    with Branches(x) as beside:
+    with Streams(x) as streams:
         for scale in (1.0, 2.0, 3.0, 4.0, 5.0):
             scaled = x * scale
-            results.append(beside.run(chain, scaled, weight))
+            results.append(streams.run(chain, scaled, weight))
             del scaled  # what comes next may not take its memory before the chain has read it
             results.append(x * -scale)
     return torch.stack(results).sum(0)
@@ -29,8 +29,8 @@ def chains(x, weight):
 
 def test_in_order_without_a_graph():
     seen = []
-    with Branches(torch.ones(1)) as beside:
-        assert beside.run(lambda a, b: seen.append(a) or b, 1, 2) == 2
+    with Streams(torch.ones(1)) as streams:
+        assert streams.run(lambda a, b: seen.append(a) or b, 1, 2) == 2
         seen.append(2)
     assert seen == [1, 2]
 
@@ -46,10 +46,10 @@ def test_a_graph_with_branches_has_the_same_bits(devices):
     assert_same_bits(captured(), chains(x, weight))
 
 
-def test_what_fails_in_a_branch_is_told(devices):
+def test_failure_in_a_stream_is_raised(devices):
     def wrong(x):
-        with Branches(x) as beside:
-            beside.run(lambda: x[0].item())
+        with Streams(x) as streams:
+            streams.run(lambda: x[0].item())
 
     x = torch.ones(3, device=devices[1])
     with pytest.raises(CaptureError, match="captur"):

@@ -1,4 +1,4 @@
-"""Index lists that the CPU would refuse, on CUDA, where nobody looks at them.
+"""Index lists that the CPU would refuse, on CUDA, where they are not checked.
 
 Whatever they hold, results are finite, and 0 where a row of the result has no valid source. All memory that an op takes
 is filled with NaN before.

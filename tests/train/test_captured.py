@@ -206,7 +206,7 @@ class FullGPU:
     def __call__(self, function, device, pool):
         self.pools.append(pool)
         if pool is None and len(self.captured._steps) > 1:
-            raise CaptureError("Captured: CUDA out of memory.", no_room=True)
+            raise CaptureError("Captured: CUDA out of memory.", out_of_memory=True)
         return self.make(function, device, pool)
 
 
@@ -263,17 +263,17 @@ def test_memory_pool_without_graphs_is_not_reused(scenes, trainer, full_gpu, mon
     assert captured.graph(first, len) == (0, 8)
 
 
-@pytest.mark.parametrize("no_room, tries, match", [(True, 2, "lower batch, target_views or"), (False, 1, "^no$")])
-def test_graph_that_does_not_fit_alone_is_refused(no_room, tries, match, scenes, trainer, full_gpu, monkeypatch):
+@pytest.mark.parametrize("out_of_memory, tries, match", [(True, 2, "lower batch, target_views or"), (False, 1, "^no$")])
+def test_graph_that_does_not_fit_alone_is_refused(out_of_memory, tries, match, scenes, trainer, full_gpu, monkeypatch):
     def make(function, device, pool):
-        raise CaptureError("no", no_room=no_room)
+        raise CaptureError("no", out_of_memory=out_of_memory)
 
     monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: (0, 7))
     captured = captured_loss(trainer)
     gpu = full_gpu(captured, make)
     with pytest.raises(CaptureError, match=match) as caught:
         captured.graph(None, len)
-    assert caught.value.no_room == no_room and len(gpu.pools) == tries
+    assert caught.value.out_of_memory == out_of_memory and len(gpu.pools) == tries
 
 
 class Ops(TorchDispatchMode):

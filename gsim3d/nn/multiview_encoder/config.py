@@ -12,23 +12,25 @@ from gsim3d.errors import InputError, check_ranges
 class EncoderConfig:
     """Sizes of the inverse renderer; the defaults are the paper's.
 
-    Features:
+    Attributes:
         feature_dim: C, channels of the multi-view features; a multiple of 4.
         downscale_factor: s, image pixels a feature pixel along each axis: 2, 4 or 8.
-        cnn_dims: channels of the CNN's stages at strides 2, 4, 8 ... until s is reached, then at s.
-        cnn_blocks: residual blocks of each stage.
+        cnn_dims: channels of the CNN's levels at strides 2, 4, 8 ... until s is reached, then at s.
+        cnn_blocks: residual blocks of each level.
         transformer_layers: layers of self- and cross-view attention.
         transformer_mlp_ratio: hidden channels of their feed-forward parts over 2 C.
         window_split: K; attention sees windows of 1/K of the feature map along each axis, shifted in every other layer.
-    Depth:
         n_depths: D, depth candidates between far and near, evenly spaced in disparity.
-        cost_unet_dim, cost_unet_levels: channels and resolutions of the U-Net on the cost volume.
+        cost_unet_dim: channels of the U-Net on the cost volume.
+        cost_unet_levels: its resolutions.
         cost_unet_attention: its downsampling factors at which views attend to each other.
-        refine_unet_dim, refine_unet_levels, refine_unet_attention: the same for the U-Net on full-resolution images.
+        refine_unet_dim: as ``cost_unet_dim``, of the U-Net on full-resolution images.
+        refine_unet_levels: the same.
+        refine_unet_attention: the same.
         upsampled_dim: channels of the features brought to full resolution; 0: feature_dim.
         disparity_dim: hidden channels of the full-resolution disparity and opacity head.
-    Particles:
-        dynamic_dim, static_dim: channels of the latents that change with time and that do not.
+        dynamic_dim: channels of the latents that change with time.
+        static_dim: channels of those that do not.
         condition_dim: hidden channels of the network that scales and shifts features by depth and viewing ray.
         explicit: also predict rotation, scale and spherical harmonics of each particle.
         sh_degree: degree of these harmonics.

@@ -27,8 +27,14 @@ INITIAL_OUTPUT = 0.01  # scale of the untrained disparity correction and opacity
 class Views:
     """Images and cameras of n clouds with V views each; I = n * V, views of one cloud one after another.
 
-    images [I, 3, H, W] in [0, 1], Ks [I, 3, 3] float64 pixels, viewmats [I, 4, 4] float64 world-to-camera,
-    near and far [I] metres. geometry: what follows from the cameras; None: made where it is needed.
+    Attributes:
+        images: [I, 3, H, W] in [0, 1].
+        Ks: [I, 3, 3] float64 pixels.
+        viewmats: [I, 4, 4] float64 world-to-camera.
+        near: [I] metres.
+        far: [I] metres.
+        n_views: V.
+        geometry: what follows from the cameras; None: made where it is needed.
     """
 
     images: Tensor
@@ -42,7 +48,13 @@ class Views:
 
 @dataclass(frozen=True)
 class Depth:
-    """depth [I, 1, H, W] metres, opacity_logit [I, 1, H, W], features [I, F, H, W] for the heads."""
+    """What is predicted of every pixel.
+
+    Attributes:
+        depth: [I, 1, H, W] metres.
+        opacity_logit: [I, 1, H, W].
+        features: [I, F, H, W] for the heads.
+    """
 
     depth: Tensor
     opacity_logit: Tensor

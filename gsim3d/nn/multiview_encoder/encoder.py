@@ -65,7 +65,8 @@ class Encoder(nn.Module):
             shapes: of :meth:`static_shapes`, for frames that differ from these in their numbers only. Nothing then
                 waits for the device, and nothing is checked; pixels beyond the capacity are left out.
             check: look for what cannot be used; a caller that has done so leaves it out.
-        Gradients: ``frames.images`` and the parameters; of convolutions as torch's own switch for them says.
+        Gradients:
+            ``frames.images`` and the parameters; of convolutions as torch's own switch for them says.
         Raises:
             InputError: sizes do not fit the network's strides or each other; the message names the argument.
             NumericalError: an image, camera or origin is not finite or out of range; the message names scene, step and

@@ -18,8 +18,13 @@ from gsim3d.nn.multiview_encoder.layout import for_convolution
 
 @dataclass(frozen=True)
 class PixelRays:
-    """Where pixels look. centers [I, 3] and rotations [I, 3, 3] (camera-to-world) of the cameras, world frame;
-    inverse_Ks [I, 3, 3]. Made in float64."""
+    """Viewing rays of pixels, made in float64.
+
+    Attributes:
+        centers: [I, 3] of the cameras, world.
+        rotations: [I, 3, 3] of the cameras, camera-to-world.
+        inverse_Ks: [I, 3, 3].
+    """
 
     centers: Tensor
     rotations: Tensor
@@ -70,7 +75,17 @@ class Conditioning(nn.Module):
 
 @dataclass(frozen=True)
 class PixelParticles:
-    """One particle a pixel, [I, H * W, .]; pixel (u, v) is row v * W + u. Fields as in Particles."""
+    """One particle a pixel, [I, H * W, .]; pixel (u, v) is particle v * W + u. Attributes as in Particles.
+
+    Attributes:
+        means: metres, world.
+        opacities: in (0, 1).
+        dynamic_latents: change with time.
+        static_latents: do not.
+        quats: only in explicit models.
+        scales: only in explicit models.
+        sh: only in explicit models.
+    """
 
     means: Tensor
     opacities: Tensor
