@@ -46,7 +46,7 @@ def without_rate(config):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    return write_scene(tmp_path_factory.mktemp("film") / "0000", n_steps=7)
+    return write_scene(tmp_path_factory.mktemp("scene") / "0000", n_steps=7)
 
 
 @pytest.fixture

@@ -98,8 +98,8 @@ def test_small_images_are_enlarged_with_a_warning(restored, tmp_path):
     scene, said = opened(restored, rig(tmp_path / "scene", 5, size=16))
     assert said == "fitted to the model: images of 16x16 pixels scaled to 32x32"
     assert torch.allclose(scene.cameras_at([0], [0]).Ks[0, :2], torch.tensor([[41.6, 0, 16], [0, 41.6, 16]]))
-    ball, filmed = ((s.segmentation([0], [0]) == 3).sum() for s in (scene, Scene.open(scene.path)))
-    assert 3.5 * filmed < ball < 8 * filmed
+    ball, recorded = ((s.segmentation([0], [0]) == 3).sum() for s in (scene, Scene.open(scene.path)))
+    assert 3.5 * recorded < ball < 8 * recorded
 
 
 def portrait(folder):

@@ -25,7 +25,7 @@ GIVEN, N_STEPS = 2, 6
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    return write_scenes(tmp_path_factory.mktemp("films") / "data", 2, n_steps=N_STEPS)
+    return write_scenes(tmp_path_factory.mktemp("scenes") / "data", 2, n_steps=N_STEPS)
 
 
 @pytest.fixture

@@ -171,12 +171,12 @@ def test_constant_velocity_is_exact_for_a_body_that_translates(restored, scene):
 
 
 def test_baselines_of_a_body_that_translates(restored, scene, monkeypatch):
-    """The film shows the hand-made body: continuing it is right, holding it is worse the longer it is held."""
+    """The images show the hand-made body: continuing it is right, holding it is worse the longer it is held."""
     truth = falling_apart(restored, scene, 6)
     monkeypatch.setattr(protocol, "predict", lambda *_: Prediction(truth, 2, (0, 2)))
-    film = render_steps(restored, truth, scene, [3])
+    images = render_steps(restored, truth, scene, [3])
     monkeypatch.setattr(
-        scene, "images", lambda cams, steps: (film * 255).round().to(torch.uint8).permute(0, 1, 4, 2, 3)
+        scene, "images", lambda cams, steps: (images * 255).round().to(torch.uint8).permute(0, 1, 4, 2, 3)
     )
     values = {name: v["psnr"] for name, v in score_scene(restored, scene).values.items() if "psnr" in v}
     assert (values["model"] > 50).all() and (values["constant_velocity"][2:] > 50).all()  # rounded to 8 bits
@@ -215,9 +215,9 @@ def test_baselines_are_seen_by_cameras_that_move(restored, scene, tmp_path, monk
         torch.testing.assert_close(images[2:, 0], still[step, 1].expand(2, 32, 32, 3))  # camera 3 is where 4 was
     body = falling_apart(restored, scene, 6)
     monkeypatch.setattr(protocol, "predict", lambda *_: Prediction(body, 2, (0, 2)))
-    film = render_steps(restored, body, moving, [3])
+    images = render_steps(restored, body, moving, [3])
     monkeypatch.setattr(
-        moving, "images", lambda cams, steps: (film * 255).round().to(torch.uint8).permute(0, 1, 4, 2, 3)
+        moving, "images", lambda cams, steps: (images * 255).round().to(torch.uint8).permute(0, 1, 4, 2, 3)
     )
     values = {name: v["psnr"] for name, v in score_scene(restored, moving).values.items() if "psnr" in v}
     assert (values["model"] > 50).all() and (values["constant_velocity"][2:] > 50).all()
@@ -294,7 +294,7 @@ def test_pictures(restored, scene, device):
     prediction = predict(restored, scene, (0, 2), 6)
     images = as_bytes(render_steps(restored, prediction.particles, scene, [3, 1]))
     truth = true_images(scene, [3, 1], range(8))
-    assert truth[5].any() and not truth[6:].any()  # the film has six steps
+    assert truth[5].any() and not truth[6:].any()  # the scene has six steps
     frames = comparison_frames(truth, images)
     assert len(frames) == 8 and frames[0].shape == (516, 516, 3)
     assert (frames[0][:256, :256] == truth[0, 0].repeat(8, 0).repeat(8, 1)).all()

@@ -15,7 +15,7 @@ from gsim3d.evaluate.scoring import METRICS, SceneScores, SceneTruth
 S, V, H, W, GIVEN = 5, 2, 12, 14, 2
 
 
-def film(seed=0, n_steps=S, height=H, width=W):
+def video(seed=0, n_steps=S, height=H, width=W):
     return torch.rand(n_steps, V, height, width, 3, generator=torch.Generator().manual_seed(seed)) * 0.5
 
 
@@ -32,7 +32,7 @@ def db(error):
 
 
 def test_masks_by_hand():
-    truth = film()
+    truth = video()
     predicted = truth.clone()
     predicted[..., : W // 2, :] += 0.1  # background
     predicted[:, 0, :, -2:] += 0.3
@@ -50,19 +50,19 @@ def test_masks_by_hand():
 
 
 def test_invalid_pixels_are_no_error():
-    truth, filmed = film(), torch.ones(S, V, H, W, dtype=torch.bool)
-    filmed[..., 11:] = False  # padding
-    truth = truth * filmed[..., None]
-    predicted = truth + 0.1 * filmed[..., None]
+    truth, valid = video(), torch.ones(S, V, H, W, dtype=torch.bool)
+    valid[..., 11:] = False  # padding
+    truth = truth * valid[..., None]
+    predicted = truth + 0.1 * valid[..., None]
     predicted[..., 11:, :] = 0.7
-    judge = SceneTruth("a", truth, None, filmed, GIVEN, ("psnr", "ssim"))
-    scores = judge.score([("model", predicted), ("exact", truth + 0.5 * ~filmed[..., None])]).values
+    judge = SceneTruth("a", truth, None, valid, GIVEN, ("psnr", "ssim"))
+    scores = judge.score([("model", predicted), ("exact", truth + 0.5 * ~valid[..., None])]).values
     assert scores["model"]["psnr"][3].item() == db(0.1)
     assert scores["exact"]["psnr"][3].item() == 100 and scores["exact"]["ssim"][3].item() == pytest.approx(1)
 
 
 def test_metrics_that_do_not_apply_are_reported(monkeypatch):
-    judge = SceneTruth("ball/3", film(height=10), None, None, GIVEN, tuple(METRICS))
+    judge = SceneTruth("ball/3", video(height=10), None, None, GIVEN, tuple(METRICS))
     assert judge.metrics == ["psnr"]
     assert judge.not_measured == {
         "psnr_masked": "ball/3 has no segmentation",
@@ -74,7 +74,7 @@ def test_metrics_that_do_not_apply_are_reported(monkeypatch):
         "lpips_vgg": "ball/3 has images of 14x10 pixels; it needs 16",
         "fvd": "it needs 10 predicted steps; ball/3 has 3",
     }
-    summary = summarize([judge.score([("model", film(height=10))])], {"psnr": "not wanted"})
+    summary = summarize([judge.score([("model", video(height=10))])], {"psnr": "not wanted"})
     assert "future.psnr" not in summary and len(notes(summary)) == len(METRICS)
     assert "PSNR masked: not measured: ball/3 has no segmentation" in table(summary)
     assert "FVD: not measured: it needs 10 predicted steps" in markdown(summary, "data")
@@ -94,9 +94,9 @@ def test_help_names_every_metric(capsys):
 
 
 def test_fvd_compares_the_predicted_steps_of_all_scenes_and_views(cheap_features):
-    films = [film(seed, n_steps=GIVEN + 10) for seed in range(3)]
+    videos = [video(seed, n_steps=GIVEN + 10) for seed in range(3)]
     scores = []
-    for i, truth in enumerate(films):
+    for i, truth in enumerate(videos):
         predicted = truth + 0.1
         predicted[:GIVEN] = 9  # given steps do not count
         scores.append(
@@ -105,13 +105,13 @@ def test_fvd_compares_the_predicted_steps_of_all_scenes_and_views(cheap_features
             )
         )
     assert scores[0].clips["truth"].shape == (V, 6)
-    assert torch.equal(scores[1].clips["truth"], fvd.clip_features(films[1][GIVEN:].transpose(0, 1)))
+    assert torch.equal(scores[1].clips["truth"], fvd.clip_features(videos[1][GIVEN:].transpose(0, 1)))
     summary = summarize(scores)
     # A shift of 0.1 in each of 6 features and no other difference.
     assert summary["future.fvd"] == pytest.approx(6 * 0.1**2, rel=1e-4) and summary["n_clips"] == 6
     assert summary["copy.future.fvd"] == pytest.approx(0, abs=1e-12)
     assert notes(summary) == ["FVD: of 6 clips; below 256 it shows a trend, not a measurement"]
-    one = SceneTruth("a", films[0][:, :1], None, None, GIVEN, ("fvd",)).score([("model", films[0][:, :1])])
+    one = SceneTruth("a", videos[0][:, :1], None, None, GIVEN, ("fvd",)).score([("model", videos[0][:, :1])])
     assert "needs 2 clips" in summarize([one])["not_measured"]["fvd"]
 
 
@@ -120,7 +120,7 @@ def test_lpips_is_measured_with_both_networks(monkeypatch):
     monkeypatch.setattr(
         scoring.lpips, "lpips", lambda a, b, network: called.append(network) or (a - b).abs().mean((1, 2, 3)).double()
     )
-    truth = film(height=32, width=32)
+    truth = video(height=32, width=32)
     scores = SceneTruth("a", truth, None, None, GIVEN, ("lpips_alex", "lpips_vgg")).score([("model", truth + 0.25)])
     assert called == ["alex", "vgg"] * S
     assert scores.values["model"]["lpips_vgg"].tolist() == pytest.approx([0.25] * S)
