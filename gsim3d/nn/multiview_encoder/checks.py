@@ -1,4 +1,4 @@
-"""Are these frames something the encoder can read? Every field is looked at here, once."""
+"""Validation of the encoder's input: types and shapes first, then all values in one device synchronisation."""
 
 from __future__ import annotations
 
@@ -21,7 +21,15 @@ MEND = "mend its calibration or leave it out"
 
 
 class _Wanted(NamedTuple):
-    """good: bool, of each image, cloud or scene (``of``). what: what a bad one is not, and ``advice`` what to do."""
+    """One check of a field.
+
+    Attributes:
+        name: of the field.
+        good: bool, whether each image, cloud or scene passes.
+        what: the requirement, in words.
+        of: what the entries are: "image", "scene", or "" for entries without a scene.
+        advice: what to do.
+    """
 
     name: str
     good: Tensor
@@ -31,11 +39,16 @@ class _Wanted(NamedTuple):
 
 
 def check_frames(frames: Frames, config: EncoderConfig, dtype: torch.dtype, *, pixels: bool = True) -> None:
-    """Raises InputError or NumericalError naming the field that is wrong, and where.
+    """Raises an error that names the field that is wrong, and where.
 
     Args:
+        frames: to encode.
+        config: of the encoder.
         dtype: of the network, and so of images.
-        pixels: look at the values of images, too.
+        pixels: whether to check the values of images too.
+    Raises:
+        InputError: a type, device, shape or index is wrong.
+        NumericalError: a value is not finite or out of range.
     """
     _check_layout(frames, config, dtype)
     wanted = _wanted(frames)
@@ -45,12 +58,12 @@ def check_frames(frames: Frames, config: EncoderConfig, dtype: torch.dtype, *, p
         wanted.append(_Wanted("images", finite, "must be finite", advice=advice))
         usable = usable_pixels(lowest) & usable_pixels(highest)
         wanted.append(_Wanted("images", usable, "must be in [0, 1]", advice=advice))
-    if not bool(torch.cat([check.good for check in wanted]).all()):  # the device is waited for once
+    if not bool(torch.cat([check.good for check in wanted]).all()):  # the one synchronisation
         _refuse(frames, next(check for check in wanted if not bool(check.good.all())))
 
 
 def _check_layout(frames: Frames, config: EncoderConfig, dtype: torch.dtype) -> None:
-    """Types, devices, dtypes and shapes: nothing that waits for a device."""
+    """Types, devices, dtypes and shapes, without a device synchronisation."""
     images, cameras = frames.images, frames.cameras
     if not isinstance(cameras, Cameras):
         raise InputError(f"encoder: cameras must be gsim3d.Cameras; got {type(cameras).__name__}")

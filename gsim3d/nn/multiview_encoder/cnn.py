@@ -1,4 +1,4 @@
-"""The CNN that looks at each image alone."""
+"""Features of each image by itself."""
 
 import functools
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
@@ -22,7 +23,13 @@ from gsim3d.state import ASLEEP, DYNAMIC, FROZEN, CloudTable, Particles
 
 
 def pixel_rows(frames: Frames, values: Tensor, shapes: StaticShapes | None = None) -> Tensor:
-    """``values`` [I, H, W] of the pixels that become particles, in their order; 0 in the padding of ``shapes``."""
+    """Values of the pixels that become particles, in the order of these.
+
+    Args:
+        frames: what is encoded.
+        values: [I, H, W], of pixels.
+        shapes: as of :meth:`Encoder.forward`; values of padding are 0.
+    """
     if shapes is not None:
         index = PixelIndex.of(frames, shapes)
         return torch.where(index.exists, values.flatten()[index.pixel], 0)
@@ -53,24 +60,32 @@ class Encoder(nn.Module):
         self.to(memory_format=torch.channels_last)  # convolutions with few channels are faster on it, on CPU and GPU
 
     def check(self, frames: Frames, *, pixels: bool = True) -> None:
-        """Raises as :meth:`forward` does for ``frames``; ``pixels``: also for the values of images."""
+        """Raises as :meth:`forward` does.
+
+        Args:
+            frames: to encode.
+            pixels: whether to check the values of images too.
+        """
         check_frames(frames, self.config, next(self.parameters()).dtype, pixels=pixels)
 
     def forward(self, frames: Frames, shapes: StaticShapes | None = None, *, check: bool = True) -> Particles:
         """Particles of every cloud: images in ascending order, pixels line by line, inside ``masks``.
 
-        On a GPU it computes in float32 unless autocast, or torch's switch for TF32 in matrix products, says otherwise.
+        On a GPU it computes in float32 unless autocast, or torch's switch for TF32 in matrix products, is on.
 
         Args:
-            shapes: of :meth:`static_shapes`, for frames that differ from these in their numbers only. Nothing then
-                waits for the device, and nothing is checked; pixels beyond the capacity are left out.
-            check: look for what cannot be used; a caller that has done so leaves it out.
-        Gradients:
-            ``frames.images`` and the parameters; of convolutions as torch's own switch for them says.
+            frames: images and cameras of all clouds.
+            shapes: of :meth:`static_shapes`, for frames whose values alone differ. There is then no device
+                synchronisation and no check; pixels beyond the capacity are left out.
+            check: whether to validate ``frames``; False where the caller has done so.
+        Returns:
+            One particle a pixel.
         Raises:
             InputError: sizes do not fit the network's strides or each other; the message names the argument.
             NumericalError: an image, camera or origin is not finite or out of range; the message names scene, step and
                 tensor.
+        Gradients:
+            Flow to ``frames.images`` and the parameters; of convolutions as torch's own switch for them says.
         """
         if shapes is not None:
             with tf32_only_if_asked():
@@ -82,10 +97,14 @@ class Encoder(nn.Module):
 
     @torch.no_grad()
     def static_shapes(self, frames: Frames, size: int) -> StaticShapes:
-        """Static shapes for ``size`` particles a cloud, made of the cameras; images and masks may then be others.
+        """Static shapes that follow from the cameras; images and masks may then change.
 
+        Args:
+            frames: whose clouds have equal numbers of views.
+            size: particles of a cloud.
         Raises:
-            InputError, NumericalError: as :meth:`forward`; or clouds have different numbers of views.
+            InputError: as :meth:`forward`, or clouds have different numbers of views.
+            NumericalError: as :meth:`forward`.
         """
         self.check(frames)
         n_clouds, cameras = frames.cloud_scene.shape[0], frames.cameras
@@ -125,22 +144,17 @@ class Encoder(nn.Module):
         )
 
     def _encode(self, frames: Frames) -> Particles:
-        n_clouds = frames.cloud_scene.shape[0]
+        """Clouds with equally many views are encoded together."""
         image_cloud = frames.cameras.image_cloud
-        n_views = torch.bincount(image_cloud, minlength=n_clouds)
+        n_views = torch.bincount(image_cloud, minlength=frames.cloud_scene.shape[0])
         order = torch.argsort(image_cloud, stable=True)
-        parts, images_of_parts = [], []
-        for count in n_views.unique().tolist():
-            if count > 0:
-                images = order[n_views[image_cloud[order]] == count]
-                parts.append(self._encode_images(frames, images, count))
-                images_of_parts.append(images)
-        return self._assemble(frames, parts, images_of_parts, order, n_views)
-
-    def _encode_images(self, frames: Frames, images: Tensor, n_views: int) -> PixelParticles:
-        """Images of clouds with ``n_views`` views each, cloud by cloud."""
-        chosen = dataclasses.replace(frames, images=frames.images[images], cameras=frames.cameras.select(images))
-        return self._predict(_views(chosen, n_views), frames.origin[_scene_of_image(chosen)])
+        groups = {count: order[n_views[image_cloud[order]] == count] for count in n_views.unique().tolist() if count}
+        parts = []
+        for count, images in groups.items():
+            chosen = dataclasses.replace(frames, images=frames.images[images], cameras=frames.cameras.select(images))
+            parts.append(self._predict(_views(chosen, count), frames.origin[_scene_of_image(chosen)]))
+        place = torch.cat(list(groups.values())).argsort()[order] if len(groups) > 1 else None
+        return self._assemble(frames, parts, place, order, n_views)
 
     def _predict(self, views: Views, origin: Tensor) -> PixelParticles:
         """origin: [I, 3], of the scene that each image shows."""
@@ -150,44 +164,33 @@ class Encoder(nn.Module):
         return self.heads(depth, views, origin)
 
     def _assemble(
-        self, frames: Frames, parts: list[PixelParticles], images_of_parts: list[Tensor], order: Tensor, n_views: Tensor
+        self, frames: Frames, parts: list[PixelParticles], place: Tensor | None, order: Tensor, n_views: Tensor
     ) -> Particles:
-        """Puts the images of all parts in the order of clouds and drops masked pixels."""
-        device, n_pixels = frames.images.device, frames.images.shape[2] * frames.images.shape[3]
-        place = None
-        if len(parts) > 1:
-            place = torch.empty_like(order)
-            place[torch.cat(images_of_parts)] = torch.arange(order.shape[0], device=device)
-        kept, kept_rows, row_of_pixel = None, None, None
+        """Particles without masked pixels; the images of ``order`` lie at ``place`` among those of ``parts``."""
+        n_pixels = frames.images.shape[2] * frames.images.shape[3]
+        kept, index, place_of_pixel, per_image = None, None, None, torch.full_like(order, n_pixels)
         if frames.masks is not None:
             kept = frames.masks[order].flatten()
-            kept_rows = kept.nonzero()[:, 0]
-            row_of_pixel = torch.where(kept, kept.cumsum(0) - 1, kept_rows.shape[0])
+            index = kept.nonzero()[:, 0]
+            place_of_pixel = torch.where(kept, kept.cumsum(0) - 1, index.shape[0])
+            per_image = kept.reshape(-1, n_pixels).sum(1, dtype=torch.int64)
 
-        def rows(name: str) -> Tensor | None:
+        def field(name: str) -> Tensor | None:
             values = [getattr(part, name) for part in parts]
-            if any(value is None for value in values):
+            if values[0] is None:
                 return None
-            joined = (values[0] if place is None else torch.cat(values)[place[order]]).flatten(0, 1)
-            return joined if kept is None else _Kept.apply(joined, kept_rows, row_of_pixel)
+            joined = (values[0] if place is None else torch.cat(values)[place]).flatten(0, 1)
+            return joined if kept is None else _Kept.apply(joined, index, place_of_pixel)
 
-        if frames.masks is None:
-            per_image = torch.full_like(order, n_pixels)
-        else:
-            per_image = frames.masks[order].flatten(1).sum(1, dtype=torch.int64)
-        per_cloud = torch.zeros_like(n_views).index_add_(0, frames.cameras.image_cloud[order], per_image)
-        cu_rows = torch.zeros(n_views.shape[0] + 1, dtype=torch.int64, device=device)
-        cu_rows[1:] = per_cloud.cumsum(0)
-        if frames.dynamic is None:
-            activity = torch.full((order.shape[0] * n_pixels,), DYNAMIC, dtype=torch.uint8, device=device)
-        else:
-            activity = torch.where(frames.dynamic[order].flatten(), DYNAMIC, FROZEN).to(torch.uint8)
+        activity = torch.full((order.shape[0] * n_pixels,), DYNAMIC, dtype=torch.uint8, device=order.device)
+        if frames.dynamic is not None:
+            activity.masked_fill_(~frames.dynamic[order].flatten(), FROZEN)
         return Particles(
-            **{name: rows(name) for name in PixelParticles.__dataclass_fields__},
-            cu_rows=cu_rows,
+            **{name: field(name) for name in PixelParticles.__dataclass_fields__},
+            cu_rows=F.pad(per_image.cumsum(0), (1, 0))[F.pad(n_views.cumsum(0), (1, 0))],
             cloud_scene=frames.cloud_scene,
             cloud_step=frames.cloud_step,
-            activity=activity if kept is None else activity[kept_rows],
+            activity=activity if kept is None else activity[index],
             origin=frames.origin,
             world_offset=frames.world_offset,
         )
@@ -204,9 +207,9 @@ def _scene_of_image(frames: Frames) -> Tensor:
 
 
 class _Kept(torch.autograd.Function):
-    """Some rows of x, each once. The gradient takes rows too; torch would sort them and add them to zeros.
+    """``x[rows]`` for distinct ``rows``, whose gradient is a gather too; torch would sort and add them to zeros.
 
-    rows: which, int64. place: of each row of x its place among ``rows``, or their number.
+    ``place`` has the index among ``rows`` of each row of ``x``, or their number where it is not among them.
     """
 
     @staticmethod

@@ -1,7 +1,7 @@
-"""Where a GPU wants feature maps in memory: one pass takes them there, in the precision in which they are read.
+"""Memory formats of feature maps on a GPU: one copy brings them there, in the precision in which they are read.
 
-Its convolutions read the channels of a pixel side by side, its group norms the pixels of a channel. Left to themselves,
-both copy what lies otherwise, beside every change of precision, and again in the backward pass.
+Convolutions read channels-last, group norms channels-first. By themselves both would copy other formats, apart from
+every change of precision, and again in the backward pass.
 """
 
 import torch
@@ -13,31 +13,27 @@ from gsim3d.nn.layers import product_dtype
 
 def for_convolution(x: Tensor) -> Tensor:
     """``x`` [N, C, H, W] as a convolution reads it; on the CPU as it is."""
-    return _relaid(x, product_dtype(x), torch.channels_last) if _matters(x) else x
+    return _Relaid.apply(x, product_dtype(x), torch.channels_last) if _matters(x) else x
 
 
 def by_pixel(x: Tensor) -> Tensor:
     """``x`` [N, C, H, W] as convolutions on a GPU write it, in its own precision; on the CPU as it is."""
-    return _relaid(x, x.dtype, torch.channels_last) if _matters(x) else x
+    return _Relaid.apply(x, x.dtype, torch.channels_last) if _matters(x) else x
 
 
 class GroupNorm(nn.GroupNorm):
-    """torch's."""
+    """torch's, on input in its memory format."""
 
     def forward(self, x: Tensor) -> Tensor:
-        return super().forward(_relaid(x, self.weight.dtype, torch.contiguous_format) if _matters(x) else x)
+        return super().forward(_Relaid.apply(x, self.weight.dtype, torch.contiguous_format) if _matters(x) else x)
 
 
 def _matters(x: Tensor) -> bool:
     return x.is_cuda and not torch.compiler.is_compiling()
 
 
-def _relaid(x: Tensor, dtype: torch.dtype, memory_format: torch.memory_format) -> Tensor:
-    return _Relaid.apply(x, dtype, memory_format)
-
-
 class _Relaid(torch.autograd.Function):
-    """``x.to(dtype, memory_format=...)``, whose gradient comes back as ``x`` lies in memory."""
+    """``x.to(dtype, memory_format=...)``, whose gradient has the memory format of ``x``."""
 
     @staticmethod
     def forward(ctx, x: Tensor, dtype: torch.dtype, memory_format: torch.memory_format) -> Tensor:

@@ -1,4 +1,4 @@
-"""Frames encoded in memory of fixed sizes, so that nothing waits for the device: what a CUDA graph needs."""
+"""Frames encoded into tensors of fixed shapes without a device synchronisation, as a CUDA graph needs it."""
 
 from __future__ import annotations
 

@@ -5,12 +5,11 @@ import math
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 
 from gsim3d.nn.layers import RowLayerNorm, widened
 from gsim3d.nn.multiview_encoder.config import EncoderConfig
 
-MASKED = -100.0  # added to a score that must not count; finite, so that a row of masked keys stays finite
+MASKED = -100.0  # added to the score of a masked pair; finite, so that a softmax over masked keys alone is finite
 
 
 def sine_position_code(height: int, width: int, channels: int, like: Tensor) -> Tensor:
@@ -45,14 +44,14 @@ class Windows:
         return x.reshape(-1, k * k, self.rows * self.cols, x.shape[-1])
 
     def join(self, x: Tensor, n_views: int, shifted: bool) -> Tensor:
-        """The way back."""
+        """The inverse of :meth:`cut`."""
         k = self.split
         x = x.reshape(-1, k, k, self.rows, self.cols, x.shape[-1]).transpose(2, 3)
         x = x.reshape(-1, n_views, self.height, self.width, x.shape[-1])
         return x.roll(self.shift, (2, 3)) if shifted else x
 
     def shift_mask(self, like: Tensor) -> Tensor:
-        """[K * K, L, L] with L = rows * cols: MASKED between pixels that only wrapping around made neighbours."""
+        """[K * K, L, L] with L = rows * cols: MASKED between pixels that are neighbours only by wrapping around."""
 
         def bands(n: int, size: int, shift: int) -> Tensor:
             i = torch.arange(n, device=like.device)
@@ -64,41 +63,10 @@ class Windows:
         return (labels[:, :, None] != labels[:, None, :]).to(like.dtype) * MASKED
 
 
-class OtherViews(torch.autograd.Function):
-    """[n * V, K * K, L, C] -> [n * V, K * K, (V - 1) * L, C]: what the other views show in the same window, from the
-    next one on. Its gradient is a plain sum, in one order."""
-
-    @staticmethod
-    def forward(ctx, x: Tensor, n_views: int) -> Tensor:
-        ctx.n_views = n_views
-        n_images, n_windows, length, dim = x.shape
-        image, window, offset = _grid(n_images, n_windows, range(1, n_views), x)
-        rows = _turned(image, offset, n_views) * n_windows + window
-        return x.reshape(-1, length * dim)[rows.flatten()].view(n_images, n_windows, -1, dim)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:
-        n_views = ctx.n_views
-        n_images, n_windows, length, dim = grad.shape
-        image, window, offset = _grid(n_images, n_windows, range(1, n_views), grad)
-        rows = (_turned(image, -offset, n_views) * n_windows + window) * (n_views - 1) + offset - 1
-        length //= n_views - 1
-        shown = grad.reshape(-1, length * dim)[rows.flatten()]
-        return shown.view(n_images, n_windows, n_views - 1, length, dim).sum(2), None
-
-
-def _grid(n_images: int, n_windows: int, offsets: range, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Numbers of images, windows and offsets, to be broadcast."""
-    image, window = torch.arange(n_images, device=like.device), torch.arange(n_windows, device=like.device)
-    offset = torch.arange(offsets.start, offsets.stop, device=like.device)
-    return image[:, None, None], window[:, None], offset
-
-
-def _turned(image: Tensor, offset: Tensor, n_views: int) -> Tensor:
-    """The image that is ``offset`` views behind ``image`` in its cloud."""
-    view = image % n_views
-    return image - view + (view + offset) % n_views
+def other_views(x: Tensor, n_views: int) -> Tensor:
+    """[n * V, K * K, L, C] -> [n * V, K * K, (V - 1) * L, C]: the same window of the others, from the next view on."""
+    clouds = x.unflatten(0, (-1, n_views))
+    return torch.cat([clouds.roll(-offset, 1) for offset in range(1, n_views)], 3).flatten(0, 1)
 
 
 class Attention(nn.Module):
@@ -120,7 +88,7 @@ class Attention(nn.Module):
             self.mlp = None
 
     def forward(self, x: Tensor, source: Tensor, attend) -> Tensor:
-        """x asks, source answers; attend(q, k, v) knows who sees whom."""
+        """Queries come from ``x``, keys and values from ``source``; ``attend`` is a function of the three."""
         message = self.merge(attend(self.q_proj(x), self.k_proj(source), self.v_proj(source))).flatten(0, -2)
         rows = x.flatten(0, -2)
         if self.mlp is None:
@@ -131,6 +99,8 @@ class Attention(nn.Module):
 
 
 class Layer(nn.Module):
+    """Attention within a view, then to the other views."""
+
     def __init__(self, dim: int, mlp_dim: int):
         super().__init__()
         self.self_attn = Attention(dim)
@@ -138,7 +108,7 @@ class Layer(nn.Module):
 
 
 class MultiViewTransformer(nn.Module):
-    """[n, V, C, h, w] features of n clouds with V views each -> the same shape, informed by all views."""
+    """Self-attention and attention between views: features [n, V, C, h, w] of n clouds -> the same shape."""
 
     def __init__(self, config: EncoderConfig):
         super().__init__()
@@ -151,7 +121,7 @@ class MultiViewTransformer(nn.Module):
 
     def cross_mask(self, mask: Tensor, n_views: int) -> Tensor:
         """[1 or V, K * K, L, (V - 1) * L]: :meth:`Windows.shift_mask` between the pixels of a view and those of the
-        others, in the order of :class:`OtherViews`."""
+        others, in the order of :func:`other_views`."""
         return mask.repeat(1, 1, n_views - 1)[None]
 
     def forward(self, x: Tensor) -> Tensor:
@@ -175,9 +145,9 @@ class MultiViewTransformer(nn.Module):
                 if n_views == 1:
                     return torch.zeros_like(v)
                 q, k, v = (windows.cut(t, shifted) for t in (q, k, v))
-                k, v = (OtherViews.apply(t, n_views) for t in (k, v))
+                k, v = (other_views(t, n_views) for t in (k, v))
                 return windows.join(F.scaled_dot_product_attention(q, k, v, between), n_views, shifted)
 
-            # Other views are read as they entered the layer, before they looked at themselves.
+            # Other views are read as they entered the layer, before their self-attention.
             x = layer.cross_attn_ffn(layer.self_attn(x, x, attend_self), x, attend_others)
         return x.permute(0, 1, 4, 2, 3)

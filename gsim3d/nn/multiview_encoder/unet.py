@@ -1,4 +1,4 @@
-"""U-Nets whose coarsest features see all views of a cloud."""
+"""U-Nets whose coarsest features attend to all views of a cloud."""
 
 import torch
 import torch.nn.functional as F
@@ -81,9 +81,12 @@ class Stem(nn.Conv2d):
 
 
 class UNet(nn.Module):
-    """[n * V, C, h, w] -> the same shape. Views of one cloud lie one after another.
+    """[n * V, C, h, w] -> the same shape, the views of one cloud one after another.
 
-    attention: downsampling factors at which the views of a cloud attend to each other.
+    Args:
+        dim: C.
+        levels: resolutions.
+        attention: downsampling factors at which the views of a cloud attend to each other.
     """
 
     def __init__(self, dim: int, levels: int, attention: tuple[int, ...]):

@@ -1,11 +1,11 @@
-"""Where feature maps lie in memory changes no number, and what views see of each other is what was written down."""
+"""Memory formats of feature maps change no number; other views are the following ones."""
 
 import pytest
 import torch
 
 from gsim3d.nn.multiview_encoder import layout
 from gsim3d.nn.multiview_encoder.layout import by_pixel, for_convolution
-from gsim3d.nn.multiview_encoder.transformer import OtherViews
+from gsim3d.nn.multiview_encoder.transformer import other_views
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.nn.multiview_encoder.scenes import ROW_FIELDS, make_encoder, make_frames
 
@@ -65,7 +65,7 @@ def test_other_views_are_the_next_ones(n_views, device):
     wanted = torch.stack(
         [torch.cat([clouds[:, (v + k) % n_views] for k in range(1, n_views)], 2) for v in range(n_views)], 1
     ).flatten(0, 1)
-    actual = OtherViews.apply(x, n_views)
+    actual = other_views(x, n_views)
     assert_same_bits(actual.detach(), wanted.detach())
     cotangent = torch.randn_like(wanted)
     a, b = (torch.autograd.grad(y, x, cotangent, retain_graph=True)[0] for y in (actual, wanted))
