@@ -25,7 +25,8 @@ from torch.nn import functional as F
 from gsim3d.effects.selection import Selection, Vector, newest_mask
 from gsim3d.effects.spec import StructureEffects
 from gsim3d.errors import InputError
-from gsim3d.io.files import read_yaml, shown, typed
+from gsim3d.io.files import read_yaml, shown
+from gsim3d.io.settings import from_dict
 from gsim3d.math.rotations import quat_product, rotate_left, rotation_matrices
 from gsim3d.math.spherical_harmonics import painted, rotate_harmonics
 from gsim3d.state import ATTRIBUTES, FROZEN, CloudTable, Particles, newest_clouds, with_attribute, with_same_attributes
@@ -326,7 +327,7 @@ def _edit(values: Any, where: str, folder: Path, encode: Callable[[Path], Partic
             given["particles"] = encode(folder / values.pop("scene"))
         except InputError as error:
             raise InputError(f"{where}: {error}") from None
-    return Edit(step, dataclasses.replace(typed(kind, values, where), **given))
+    return Edit(step, dataclasses.replace(from_dict(kind, values, f"{where}: "), **given))
 
 
 def _changed(state: Particles, chosen: Tensor, fields: dict[str, Tensor]) -> Particles:

@@ -14,7 +14,8 @@ import yaml
 
 from gsim3d.effects.selection import Selection
 from gsim3d.errors import InputError, did_you_mean
-from gsim3d.io.files import read_yaml, shown, typed, write_whole
+from gsim3d.io.files import read_yaml, shown, write_whole
+from gsim3d.io.settings import from_dict
 
 VERSION = 1
 FILE = "effects.yaml"  # of a scene or of a whole data set, in its folder
@@ -169,7 +170,7 @@ class EffectsSpec:
         version = values.pop("version", VERSION)
         if version != VERSION:
             raise InputError(f"effects: version must be {VERSION}; got {version}")
-        return typed(cls, _converted(values), "effects")
+        return from_dict(cls, _converted(values), "effects: ")
 
     def to_dict(self) -> dict[str, Any]:
         """Nested plain values, without what is off or left to the model."""

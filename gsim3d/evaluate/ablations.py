@@ -26,7 +26,7 @@ from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import CaptureError, InputError, NumericalError, did_you_mean
 from gsim3d.evaluate.protocol import horizon, score_scene
 from gsim3d.evaluate.report import summarize, write_json
-from gsim3d.io.files import MAX_TEXT, read_file, typed, write_whole
+from gsim3d.io.files import MAX_TEXT, read_file, write_whole
 from gsim3d.io.plain import parse_json
 from gsim3d.io.settings import from_dict, load_yaml, to_dict
 from gsim3d.train.config import TrainConfig
@@ -69,7 +69,7 @@ def load_ablations(path: Path = PAPER) -> tuple[dict[str, TrainConfig], dict[str
     content = load_yaml(path)
     if not isinstance(content.get("bases"), dict) or not isinstance(content.get("rows"), list):
         raise InputError(f"{path}: must hold bases and rows")
-    rows = [typed(Row, row, f"{path}: rows[{n}]") for n, row in enumerate(content["rows"])]
+    rows = [from_dict(Row, row, f"{path}: rows[{n}]: ") for n, row in enumerate(content["rows"])]
     bases = {name: from_dict(TrainConfig, base, f"{path}: {name}") for name, base in content["bases"].items()}
     return bases, {row.name: row for row in rows}
 

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import os
 import reprlib
-import types
-import typing
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from gsim3d.errors import InputError, did_you_mean
-from gsim3d.io.plain import is_number, parse_yaml
+from gsim3d.errors import InputError
+from gsim3d.io.plain import parse_yaml
 
 _BOUNDED = reprlib.Repr()
 _BOUNDED.maxstring = _BOUNDED.maxother = 80
@@ -155,59 +152,3 @@ def shown(value: Any) -> str:
         return _BOUNDED.repr(value)
     except ValueError:  # an integer of thousands of digits
         return "a number of thousands of digits"
-
-
-def typed(cls: type, values: Any, subject: str, where: str = "") -> Any:
-    """An object of the dataclass ``cls`` from plain values, checked against the types of its fields.
-
-    Args:
-        cls: dataclass. Where it has an attribute ``alone``, a text by itself is the field of this name.
-        values: mapping of plain values.
-        subject: what the values belong to, for messages.
-        where: path of keys before these, ending in a dot.
-
-    Raises:
-        InputError: a key is unknown or missing, or a value of another type; the message starts with ``subject`` and
-            names the key.
-    """
-    if not isinstance(values, dict):
-        raise InputError(f"{subject}: {where.rstrip('.')} must be a mapping; got {shown(values)}")
-    hints = typing.get_type_hints(cls)
-    hints = {field.name: hints[field.name] for field in dataclasses.fields(cls)}
-    if unknown := [name for name in values if name not in hints]:
-        hint = did_you_mean(unknown[0], hints)
-        raise InputError(f"{subject}: unknown key {where}{str(unknown[0])[:80]}; known: {', '.join(hints)}{hint}")
-    fields = {name: _value(hints[name], value, subject, where + name) for name, value in values.items()}
-    for field in dataclasses.fields(cls):
-        if field.name not in values and field.default is field.default_factory is dataclasses.MISSING:
-            raise InputError(f"{subject}: key {where}{field.name} is missing")
-    try:
-        return cls(**fields)
-    except InputError as error:
-        if str(error).startswith(subject):
-            raise
-        raise InputError(": ".join(filter(None, (subject, where.rstrip("."), str(error))))) from None
-
-
-def _value(hint: Any, value: Any, subject: str, where: str) -> Any:
-    """``value`` as ``hint`` asks for it."""
-    if typing.get_origin(hint) is types.UnionType:
-        if value is None:
-            return None
-        hint = typing.get_args(hint)[0]
-    if dataclasses.is_dataclass(hint):
-        if isinstance(value, str) and hasattr(hint, "alone"):
-            value = {hint.alone: value}
-        return typed(hint, value, subject, f"{where}.")
-    if typing.get_origin(hint) is tuple:
-        items = typing.get_args(hint)
-        n = None if items[-1] is ... else len(items)
-        if not isinstance(value, (list, tuple)) or n not in (None, len(value)):
-            raise InputError(f"{subject}: {where} must be a list{'' if n is None else f' of {n}'}; got {shown(value)}")
-        return tuple(_value(item, v, subject, where) for item, v in zip(items if n else items[:1] * len(value), value))
-    fits = {bool: isinstance(value, bool), str: isinstance(value, str)}
-    fits |= {kind: is_number(value, kind) for kind in (int, float)}
-    if not fits.get(hint, True):
-        wanted = {bool: "true or false", str: "a text", int: "a whole number", float: "a number"}[hint]
-        raise InputError(f"{subject}: {where} must be {wanted}; got {shown(value)}")
-    return value

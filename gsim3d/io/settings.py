@@ -40,13 +40,20 @@ def to_dict(value: Any) -> Any:
 
 
 def from_dict(cls: type[T], content: dict, where: str = "", base: T | None = None) -> T:
-    """The dataclass ``cls`` from nested plain data; what ``content`` leaves out comes from ``base``, else the defaults.
+    """The dataclass ``cls`` from nested plain data, checked against the types of its fields.
+
+    Args:
+        cls: dataclass. Where it has an attribute ``alone``, a text by itself is the field of this name.
+        content: plain values by the names of the fields.
+        where: start of the messages: keys around these, or what the values belong to, with ": " at its end.
+        base: has the values that ``content`` leaves out; None: the defaults.
 
     Raises:
         InputError: an unknown key, a missing one or a value of another type; the message names the key.
     """
     if not isinstance(content, dict):
-        raise InputError(f"{where or cls.__name__}: must be a mapping of settings; got {shown(content)}")
+        what = where.removesuffix(": ") or cls.__name__
+        raise InputError(f"{what}: must be a mapping of settings; got {shown(content)}")
     hints = typing.get_type_hints(cls)
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
     unknown = [str(key) for key in content if key not in fields]
@@ -64,10 +71,10 @@ def from_dict(cls: type[T], content: dict, where: str = "", base: T | None = Non
             raise InputError(f"{_join(where, name)}: this setting is missing")
     try:
         return cls(**values)
-    except InputError as error:
-        raise InputError(f"{where}: {error}" if where else str(error)) from None
-    except ValueError as error:
-        raise InputError(f"{where or cls.__name__}: {error}") from None
+    except (InputError, ValueError) as error:
+        if isinstance(error, InputError) and (not where or str(error).startswith(where.split(":")[0] + ":")):
+            raise
+        raise InputError(f"{where.removesuffix(': ') or cls.__name__}: {error}") from None
 
 
 def upgraded(cls: type, content: Any) -> Any:
@@ -116,6 +123,8 @@ def _convert(hint: Any, value: Any, where: str, base: Any) -> Any:
                 problems.append(error)
         raise problems[0]
     if dataclasses.is_dataclass(hint):
+        if isinstance(value, str) and hasattr(hint, "alone"):
+            value = {hint.alone: value}
         return from_dict(_variant(hint, value, where), value, where, base)
     if origin is tuple:
         if not isinstance(value, (list, tuple)):
@@ -123,7 +132,7 @@ def _convert(hint: Any, value: Any, where: str, base: Any) -> Any:
         if len(arguments) == 2 and arguments[1] is Ellipsis:
             arguments = (arguments[0],) * len(value)
         if arguments and len(arguments) != len(value):
-            raise InputError(f"{where}: must hold {len(arguments)} values; got {len(value)}")
+            raise InputError(f"{where}: must be a list of {len(arguments)}; got {shown(value)}")
         kinds = arguments or (Any,) * len(value)
         return tuple(_convert(kind, item, f"{where}[{i}]", None) for i, (kind, item) in enumerate(zip(kinds, value)))
     if origin is typing.Literal:
@@ -160,4 +169,4 @@ def _variant(cls: type, value: Any, where: str) -> type:
 
 
 def _join(where: str, name: str) -> str:
-    return f"{where}.{name}" if where else name
+    return f"{where}{name}" if not where or where.endswith(": ") else f"{where}.{name}"

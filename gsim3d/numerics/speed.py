@@ -14,8 +14,9 @@ import torch
 from gsim3d.cameras import InputSpec
 from gsim3d.effects.spec import EffectsSpec, Sleep
 from gsim3d.errors import InputError, check_ranges, did_you_mean
-from gsim3d.io.files import MAX_TEXT, read_file, shown, typed
+from gsim3d.io.files import MAX_TEXT, read_file, shown
 from gsim3d.io.plain import parse_json
+from gsim3d.io.settings import from_dict
 from gsim3d.ops.raster import CUTOFFS
 from gsim3d.presets import ModelConfig
 from gsim3d.state import DYNAMIC, Particles
@@ -97,7 +98,7 @@ class Setting:
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Setting:
         """Raises InputError for an unknown key or a value of another type."""
-        return typed(cls, values, "setting")
+        return from_dict(cls, values, "setting: ")
 
     @contextlib.contextmanager
     def precision(self, part: str, device: str) -> Iterator[None]:

@@ -12,7 +12,7 @@ from typing import Any
 from gsim3d.effects.plan import Plan, Workload, predicted_cost
 from gsim3d.errors import InputError
 from gsim3d.evaluate.report import write_json
-from gsim3d.io.files import typed
+from gsim3d.io.settings import from_dict
 from gsim3d.numerics.speed import SPEEDS_FILE, Setting, read_speeds
 from gsim3d.presets import ModelConfig
 from gsim3d.profile.settings import GROUPS, Group
@@ -198,4 +198,4 @@ def load_times(folder: Path, restored: Restored) -> dict[str, PartTimes]:
     """Kind of device -> what the reference of a checkpoint took where it was measured; empty where it was not."""
     devices, where = read_speeds(folder).get(restored.checkpoint.digest) or {}, folder / SPEEDS_FILE
     known = {name: kept[TIMES] for name, kept in devices.items() if isinstance(kept, dict) and TIMES in kept}
-    return {name: typed(PartTimes, values, f"{where}: {name}: {TIMES}") for name, values in known.items()}
+    return {name: from_dict(PartTimes, values, f"{where}: {name}: {TIMES}: ") for name, values in known.items()}

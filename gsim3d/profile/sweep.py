@@ -26,8 +26,9 @@ from gsim3d.evaluate.perceptual.fvd import MIN_CLIPS, frechet_distance
 from gsim3d.evaluate.protocol import default_views, horizon
 from gsim3d.evaluate.report import write_json
 from gsim3d.evaluate.scoring import METRICS, PLAIN_METRICS, SceneScores, SceneTruth
-from gsim3d.io.files import MAX_TEXT, read_file, typed
+from gsim3d.io.files import MAX_TEXT, read_file
 from gsim3d.io.plain import parse_json
+from gsim3d.io.settings import from_dict
 from gsim3d.numerics.speed import Setting
 from gsim3d.profile.settings import GROUPS, Group, Runner
 from gsim3d.profile.timing import (
@@ -581,7 +582,7 @@ class Sweep:
     def _load(self) -> dict[Setting, Point]:
         try:
             content = parse_json(read_file(self._file, MAX_TEXT))
-            points = [typed(Point, values, str(self._file)) for values in content.pop("points")]
+            points = [from_dict(Point, values, f"{self._file}: ") for values in content.pop("points")]
         except (ValueError, AttributeError, KeyError, TypeError):  # of another version: nothing but time is lost
             return {}
         return {point.setting: point for point in points} if content == self._conditions() else {}

@@ -165,17 +165,23 @@ def test_frozen_appearance_gradients():
 @pytest.mark.parametrize(
     ("held", "message"),
     [
-        ("moving", "effects: appearance.frozen_appearance must be a list; got 'moving'"),
-        ([3], "effects: appearance.frozen_appearance must be a mapping; got 3"),
-        (["ground"], "effects: appearance.frozen_appearance: which must be one of all, moving, frozen; got 'ground'"),
-        ([{"where": "here"}], "effects: unknown key appearance.frozen_appearance.where; known: which, box"),
+        ("moving", "effects: appearance.frozen_appearance: must be a list; got 'moving'"),
+        ([3], r"effects: appearance.frozen_appearance\[0\]: must be a mapping of settings; got 3"),
+        (
+            ["ground"],
+            r"effects: appearance.frozen_appearance\[0\]: which must be one of all, moving, frozen; got 'ground'",
+        ),
+        (
+            [{"where": "here"}],
+            r"effects: appearance.frozen_appearance\[0\].where: unknown setting; known here: which, box",
+        ),
         (
             [{"box": [[0, 0, 0], [1, 1]]}],
-            r"effects: appearance.frozen_appearance.box must be a list of 3; got \[1, 1\]",
+            r"effects: appearance.frozen_appearance\[0\].box\[1\]: must be a list of 3; got \[1, 1\]",
         ),
         (
             [{"box": [[0, 0, 1], [1, 1, 0]]}],
-            "effects: appearance.frozen_appearance: box must be the lowest and the highest corner",
+            r"effects: appearance.frozen_appearance\[0\]: box must be the lowest and the highest corner",
         ),
     ],
 )

@@ -198,10 +198,10 @@ def test_times_are_kept_beside_presets(tmp_path, restored):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"dynamics": "long"}, "speeds.json: cpu: measured: dynamics must be a number; got 'long'"),
-        ({"work": {"moving": "many", "frozen": 0}}, "speeds.json: cpu: measured: work.moving must be a whole number"),
-        ({"until": 3}, "speeds.json: cpu: measured: unknown key until"),
-        ({"work": {"moving": 3}}, "speeds.json: cpu: measured: key work.frozen is missing"),
+        ({"dynamics": "long"}, "speeds.json: cpu: measured: dynamics: must be a number; got 'long'"),
+        ({"work": {"moving": "many", "frozen": 0}}, "speeds.json: cpu: measured: work.moving: must be a whole number"),
+        ({"until": 3}, "speeds.json: cpu: measured: until: unknown setting"),
+        ({"work": {"moving": 3}}, "speeds.json: cpu: measured: work.frozen: this setting is missing"),
     ],
 )
 def test_damaged_times_are_refused(tmp_path, restored, change, message):

@@ -214,7 +214,7 @@ def test_optional_fixed_length_and_nested_fields():
     Outer.__annotations__ = {"inner": Inner, "kernels": tuple[tuple[int, ...], ...]}
     outer = from_dict(Outer, {"inner": {"pair": [3, 4], "limit": 1}, "kernels": [[5, 3], [3]]})
     assert outer == Outer(Inner((3, 4.0), 1.0), ((5, 3), (3,)))
-    with pytest.raises(InputError, match=r"inner\.pair: must hold 2 values; got 3"):
+    with pytest.raises(InputError, match=r"inner\.pair: must be a list of 2; got \[1, 2, 3\]"):
         from_dict(Outer, {"inner": {"pair": [1, 2, 3]}})
 
 
