@@ -120,6 +120,8 @@ def _convert(hint: Any, value: Any, where: str, base: Any) -> Any:
             try:
                 return _convert(option, value, where, base)
             except InputError as error:
+                if hasattr(option, "alone"):  # which also stands for a text
+                    raise
                 problems.append(error)
         raise problems[0]
     if dataclasses.is_dataclass(hint):
