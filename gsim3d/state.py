@@ -61,7 +61,10 @@ def keeping_constants(store: dict[tuple, Tensor]) -> Iterator[None]:
 class CloudTable:
     """``cu_rows``, ``cloud_scene`` and ``cloud_step`` of packed clouds as numbers that the host knows.
 
-    starts: Q + 1 row numbers. scenes, steps: Q numbers. tensors: the three on the device of the rows.
+    Attributes:
+        starts: Q + 1 row numbers.
+        scenes, steps: Q numbers.
+        tensors: the three on the device of the rows.
     """
 
     starts: tuple[int, ...]

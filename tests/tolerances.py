@@ -30,7 +30,7 @@ TOLERANCES = {
         2e-3, 5e-6, EPYC, "metres; heights are recorded to 5 digits, contact amplifies the last bits of others"
     ),
     "law_float32": Tolerance(
-        1e-5, 2.9e-6, EPYC, "an op on input told otherwise: sums in another order, places rounded elsewhere"
+        1e-5, 2.9e-6, EPYC, "an op on transformed input: sums in another order, positions rounded elsewhere"
     ),
     "law_float64": Tolerance(1e-12, 2.2e-14, EPYC, "as law_float32, in float64"),
     "patch_attn_float32": Tolerance(1e-6, 3.4e-7, EPYC, "float32 sums of up to 130 values against float64"),

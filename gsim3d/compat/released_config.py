@@ -50,9 +50,10 @@ NO_MEANING = object()
 class ReleasedConfig:
     """What a published checkpoint is, in this model's terms.
 
-    data: the data section of a checkpoint's config.yaml.
-    notes: what a user should know, one sentence each.
-    ignored: keys of the file that change nothing here.
+    Attributes:
+        data: the data section of a checkpoint's config.yaml.
+        notes: what a user should know, one sentence each.
+        ignored: keys of the file that change nothing here.
     """
 
     model: ReleasedModelConfig

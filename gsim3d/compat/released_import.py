@@ -26,8 +26,9 @@ MAX_NAMED = 8  # tensors that a message lists
 class UntrainedSigns:
     """Whether parts of a model never learned: see :func:`untrained_signs`.
 
-    blocks, n_blocks: attention-and-MLP blocks of the dynamics whose weights look as they were drawn, of all.
-    latent_heads: the same of the encoder's latent heads and their conditioning; None where it has none.
+    Attributes:
+        blocks, n_blocks: attention-and-MLP blocks of the dynamics whose weights look as they were drawn, of all.
+        latent_heads: the same of the encoder's latent heads and their conditioning; None where it has none.
     """
 
     blocks: int
@@ -47,8 +48,14 @@ class UntrainedSigns:
 
 @dataclass(frozen=True)
 class Imported:
-    """weights: of :class:`gsim3d.Simulator`.   n_parameters: published ones.   ignored: tensors that the model has not.
-    counts: epoch and global_step where the file tells them."""
+    """A published checkpoint as weights and configuration of this package.
+
+    Attributes:
+        weights: of :class:`gsim3d.Simulator`.
+        n_parameters: published ones.
+        ignored: tensors that the model has not.
+        counts: epoch and global_step where the file tells them.
+    """
 
     config: ReleasedConfig
     weights: dict[str, Tensor]

@@ -74,7 +74,11 @@ class ReleasedDynamicsConfig(DynamicsConfig):
 
 @dataclass(frozen=True)
 class ReleasedModelConfig(ModelConfig):
-    """release: True; a checkpoint's configuration says so by this key."""
+    """Sizes of the model of the published release.
+
+    Attributes:
+        release: True; a checkpoint's configuration says so by this key.
+    """
 
     dynamics: ReleasedDynamicsConfig = field(default_factory=ReleasedDynamicsConfig)
     release: bool = True

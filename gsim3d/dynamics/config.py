@@ -30,6 +30,7 @@ class DynamicsConfig(TransformerConfig):
         position_features: the network also sees positions relative to the scene's origin (in units of
             ``position_length`` metres) and inside the cell. Learning where the ground is takes far less data so;
             without it the network knows particles by their neighbours only, and motion does not depend on positions.
+        position_length: metres, unit of these positions.
         priors: hand-made physics, in the order in which it applies (:mod:`gsim3d.priors`); none: all is learned.
         background: "symmetric": frozen particles are like others to the network, and their latents change;
             "asymmetric": frozen particles of the newest step read each other only, never change, and are computed once

@@ -39,8 +39,10 @@ ALL_CURVES = (0, 1, 2, 3)
 class Field:
     """Where a convolution meets the background: D cells, the last of them nowhere.
 
-    cells: int64 [D], keys, ascending.   occupied: int64 [V], the cells of the background's voxels.
-    voxels, kernel_map: from the occupied cells to all.
+    Attributes:
+        cells: int64 [D], keys, ascending.
+        occupied: int64 [V], the cells of the background's voxels.
+        voxels, kernel_map: from the occupied cells to all.
     """
 
     cells: Tensor
@@ -53,11 +55,12 @@ class Field:
 class Places:
     """Where the background is found at one stage.
 
-    cells: of the fields, by kernel size.
-    first: int64 [4, P], the key at which each patch begins along each serialization; of the first patch of a scene the
-        scene's lowest.
-    kv_rows, cu_k: int64 [4, M] and [P + 1], the keys of each patch, as in :class:`PatchTable`.
-    patch_size: the most keys of a patch.
+    Attributes:
+        cells: of the fields, by kernel size.
+        first: int64 [4, P], the key at which each patch begins along each serialization; of the first patch of a scene
+            the scene's lowest.
+        kv_rows, cu_k: int64 [4, M] and [P + 1], the keys of each patch, as in :class:`PatchTable`.
+        patch_size: the most keys of a patch.
     """
 
     cells: dict[int, Tensor]
@@ -71,9 +74,12 @@ class Places:
 class FrozenContext:
     """What moving rows read of the background, through all calls of a rollout.
 
-    curves, depths: of each stage: which curves the run uses, as do calls that read it, and how many levels they have.
-    places: of each stage; none where no row is seen.
-    fields: [D, C] of every convolution, by module.   keys, values: [N, H, C / H] of every attention, by module.
+    Attributes:
+        curves, depths: of each stage: which curves the run uses, as do calls that read it, and how many levels they
+            have.
+        places: of each stage; none where no row is seen.
+        fields: [D, C] of every convolution, by module.
+        keys, values: [N, H, C / H] of every attention, by module.
     """
 
     curves: tuple[tuple[int, ...], ...]

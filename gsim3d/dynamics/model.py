@@ -101,7 +101,7 @@ class Dynamics(nn.Module):
 
     @contextlib.contextmanager
     def moving_at_most(self, n_rows: int) -> Iterator[None]:
-        """Within it no scene has more rows that may move than ``n_rows``: a GPU computes what is told of these alone,
+        """Within it no scene has more movable particles than ``n_rows``: a GPU computes features of these alone,
         as a CPU does that counts them."""
         before, self._most_movable = self._most_movable, n_rows
         try:
@@ -110,7 +110,7 @@ class Dynamics(nn.Module):
             self._most_movable = before
 
     def room(self, history: Particles) -> int:
-        """Rows that the network needs room for in calls like that of ``history``: with a background that is relit only
+        """Rows that the network needs room for in calls like that of ``history``: with a relightable background only
         those that it sees, which waits for the device."""
         if not self.config.is_relightable:
             return history.n_rows
@@ -122,7 +122,8 @@ class Dynamics(nn.Module):
         Args:
             background: at most one cloud a scene.
             generator: as :meth:`forward`.
-        Gradients: as :meth:`forward`.
+        Gradients:
+            as :meth:`forward`.
         """
         curves = self._draw_curves(generator)
         pyramid = self.geometry(background, curves=curves)
@@ -181,7 +182,8 @@ class Dynamics(nn.Module):
             changes: what a step changes, of ``layout.changes``; the rest is not computed. None: all that is predicted.
         Returns:
             One cloud a scene and step, each with the particles of the scene's newest step.
-        Gradients: features and positions of ``history``, parameters. Cells are constants.
+        Gradients:
+            features and positions of ``history``, parameters. Cells are constants.
         Raises:
             ValueError: clouds are not sorted, a history is longer than the model's, or a model with ``norm="batch"`` is
                 trained on a pyramid of given capacity: its statistics would count padding.

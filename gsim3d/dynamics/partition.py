@@ -14,10 +14,12 @@ from gsim3d.state import ASLEEP, FROZEN, CloudTable, Particles, last_steps, newe
 class Partition:
     """What moves and what rests. Scenes in which nothing moves are in neither part.
 
-    newest: the last cloud of every scene, with all its rows.
-    moving: all clouds, the rows that move.
-    background: the rows of the newest clouds that rest and are seen; None where the network does not tell them apart.
-    rows: int64, the rows of ``newest`` that the newest clouds of ``moving`` hold.
+    Attributes:
+        newest: the last cloud of every scene, with all its rows.
+        moving: all clouds, the rows that move.
+        background: the rows of the newest clouds that rest and are seen; None where the network does not tell them
+            apart.
+        rows: int64, the rows of ``newest`` that the newest clouds of ``moving`` hold.
     """
 
     newest: Particles

@@ -47,15 +47,15 @@ def rollout_in_parts(
         predict: last steps of what moves, and its background -> the next steps of what moves.
         remember: what rests -> the background that ``predict`` reads, made anew whenever others rest; None: the model
             does not tell them apart, and only whole scenes rest.
-        sleepers: who sleeps beside frozen rows; None: nobody.
-        log: is told what was computed.
+        sleepers: particles that sleep besides frozen ones; None: none.
+        log: gets the numbers of computed particles.
     """
     history, steps, parts = last_steps(history, max_steps), [], None
     log = RestLog() if log is None else log
     while len(steps) < n_steps:
         if parts is None:
             asleep, begin = None, len(steps)
-            if steps:  # all that the model sees was simulated when somebody falls asleep first
+            if steps:  # all that the model sees was simulated when a particle first falls asleep
                 history, asleep = last_steps(concatenate(steps[-max_steps:]), max_steps), sleepers.asleep
             parts = Partition.of(history, asymmetric=remember is not None, asleep=asleep)
             moving, background = parts.moving, None

@@ -4,7 +4,7 @@ A row is quiet after ``patience`` steps in which it changed by no more than ``ep
 sleeps once all its rows are quiet: scenes do not see each other. By "approx" space is cut into cubes with edges of
 ``halo`` metres. A cube sleeps while no row that is restless is in it or in one of its 26 neighbours, or will be in the
 next step if it moves on as in the last; else it wakes at once. A row that moves by less than ``halo`` a step, or
-steadily, is met by nobody asleep. Who falls asleep is asked every ``patience`` steps only, since others asleep make
+steadily, meets no sleeping row. Which rows fall asleep is decided every ``patience`` steps only, since others asleep make
 another background. Rows asleep are a background to those awake, so "approx" needs a model of
 ``background="asymmetric"``.
 
@@ -32,9 +32,11 @@ WEIGHTS = (1 << 3 * CUBE_BITS, 1 << 2 * CUBE_BITS, 1 << CUBE_BITS, 1)  # of scen
 class RestLog:
     """What a rollout did not compute.
 
-    n_rows: of the newest clouds, all scenes.
-    moving: for each step, rows that were computed.
-    remembered: how often a background was computed.   calls: of the network, over what moves.
+    Attributes:
+        n_rows: of the newest clouds, all scenes.
+        moving: for each step, rows that were computed.
+        remembered: how often a background was computed.
+        calls: of the network, over what moves.
     """
 
     n_rows: int = 0
@@ -75,9 +77,9 @@ class Sleepers:
 
     @torch.no_grad()
     def look(self, before: Particles, after: Particles) -> bool:
-        """Notes what a step changed, and decides who sleeps in the next: whether these are others than before.
+        """Whether other particles sleep in the next step than before, by what this step changed.
 
-        Waits for the device only where somebody sleeps or may fall asleep now.
+        Waits for the device only where a particle sleeps or may fall asleep now.
         """
         self.n_steps += 1
         moved = (

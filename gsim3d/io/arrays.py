@@ -160,7 +160,8 @@ def unpack_tens(packed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def read_bytes(path: Path, *starts: bytes) -> bytes:
     """The content of a file of Gaussians; of one that begins with none of ``starts``, the first bytes alone.
 
-    Raises: InputError as :func:`gsim3d.io.files.read_file`.
+    Raises:
+        InputError: as :func:`gsim3d.io.files.read_file`.
     """
     head = read_head(path)
     return read_file(path, MAX_BYTES) if not starts or head.startswith(starts) else head

@@ -75,10 +75,11 @@ _STATE_VALUES = {
 class Checkpoint:
     """What a checkpoint holds.
 
-    model, ema, optimizer: tensors by name; ema and optimizer may be empty.
-    config: the content of config.yaml: format, model, data, effects, train.
-    state: step, next_sample, and what else resuming needs; plain JSON values.
-    digest: hash that names this checkpoint; None before it is written.
+    Attributes:
+        model, ema, optimizer: tensors by name; ema and optimizer may be empty.
+        config: the content of config.yaml: format, model, data, effects, train.
+        state: step, next_sample, and what else resuming needs; plain JSON values.
+        digest: hash that names this checkpoint; None before it is written.
     """
 
     model: dict[str, Tensor]
@@ -263,7 +264,7 @@ def export(checkpoint: Checkpoint, path: str | Path) -> None:
 
 
 def _bytes_of(tensors: dict[str, Tensor], metadata: dict[str, str] | None = None) -> bytes:
-    """A .safetensors file. (Its own writer makes files that nobody else may read.)
+    """A .safetensors file. (Its own writer makes files that other users may not read.)
 
     Raises NumericalError where a tensor is not finite.
     """

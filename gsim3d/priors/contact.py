@@ -110,7 +110,8 @@ class ContactSolver:
     def displacements(self, inertial: Tensor, gained: Tensor, elastic: Tensor) -> Tensor:
         """[N, 3] metres in a step.
 
-        Gradients: of all three, of friction and offset, and of positions as far as they decide where particles stop and
+        Gradients:
+            of all three, of friction and offset, and of positions as far as they decide where particles stop and
         how near the background they are.
         """
         with torch.autocast(inertial.device.type, enabled=False):

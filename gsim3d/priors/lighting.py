@@ -220,7 +220,8 @@ def particles_between(
     """[B, M], how many samples are between each of ``positions`` [B, M, 3] and the light, in a Gaussian beam, from
     ``nearest`` on, where they begin to count over ``edge``; metres.
 
-    Gradients: of ``light``; a sample near a beam enters it when the light turns.
+    Gradients:
+        of ``light``; a sample near a beam enters it when the light turns.
     """
     direction, targets = light / light.norm(), positions
     positions, there, known = in_blocks(targets, samples.positions, samples.known)
@@ -256,7 +257,8 @@ def lambert(
         facing: [N, L], n.l of frozen particles; None: it is computed.
     Returns:
         Both [N, L], 0 to 1; 0 for sleeping particles.
-    Gradients: of ``lights``.
+    Gradients:
+        of ``lights``.
     """
     with torch.autocast(movable.positions.device.type, enabled=False):
         positions, is_lit, is_frozen = _lit_particles(movable)

@@ -72,8 +72,9 @@ def best_rotation(products: Tensor) -> Tensor:
     Where several rotations are as good, as for points on a line, the result is their mean and no rotation; for sums of
     nothing it is 0.
 
-    Source: Horn 1987: the rotation of the eigenvector q of a symmetric 4 x 4 matrix with the largest eigenvalue; powers
-        of the matrix become q q^T, whose entries make up the rotation.
+    Source:
+        Horn 1987: the rotation of the eigenvector q of a symmetric 4 x 4 matrix with the largest eigenvalue; powers of
+        the matrix become q q^T, whose entries make up the rotation.
     """
     of_quats = constant(OF_QUATS, products.device).to(products.dtype).unflatten(0, (9, 16))
     matrix = (products.flatten(-2) @ of_quats).unflatten(-1, (4, 4))

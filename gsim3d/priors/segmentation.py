@@ -64,8 +64,9 @@ def segment_bodies(movable: Movable, particles: Particles, config: SegmentationC
 
     Up to SAMPLES particles of a scene are clustered; the others belong to the nearest. No gradients.
 
-    Source: DBSCAN, Ester et al. 1996, with a density that is read off the particles; clusters with more than a neck
-        between them are joined.
+    Source:
+        DBSCAN, Ester et al. 1996, with a density that is read off the particles; clusters with more than a neck between
+        them are joined.
     """
     with torch.autocast(particles.means.device.type, enabled=False):
         samples = movable.samples

@@ -44,7 +44,8 @@ class ShapeMatching(Prior):
 
     What pulls an elastic body back is a function of w, and a history of a few steps does not show it.
 
-    Source: shape matching, Mueller et al. 2005.
+    Source:
+        shape matching, Mueller et al. 2005.
     """
 
     attributes = ("rest_positions",)

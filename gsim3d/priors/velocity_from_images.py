@@ -61,7 +61,8 @@ class VelocityFromImages(Prior):
     change as a body turns in white light. Alignment begins with the displacement of the means, and with the spin found
     in the images of the last step: since the oldest a body may have turned too far to be found again.
 
-    Source: Lucas and Kanade 1981.
+    Source:
+        Lucas and Kanade 1981.
     """
 
     attributes = ("velocity",)

@@ -79,19 +79,19 @@ class World(ABC):
     """Options of a data set. Lengths in metres, times in seconds; pairs are ranges that every trajectory draws from."""
 
     n_trajectories: int = 34  #: the usual split keeps 30 for training and 4 for tests
-    n_frames: int = 24
-    fps: float = 24.0
-    image_size: int = 64
-    n_cams: int = 12
-    seed: int = 0
+    n_frames: int = 24  #: steps of a trajectory
+    fps: float = 24.0  #: steps per second
+    image_size: int = 64  #: pixels, width and height
+    n_cams: int = 12  #: cameras, on two rings
+    seed: int = 0  #: another seed gives other trajectories
     subset: str = TRAIN  #: which set of scenes; a held-out one draws other random numbers
-    engine: str = "mujoco"
-    objects: tuple[str, ...] = shapes.SOFT_SHAPES
+    engine: str = "mujoco"  #: simulator of bodies, a key of ENGINES
+    objects: tuple[str, ...] = shapes.SOFT_SHAPES  #: shapes, dealt to the trajectories in turn
     meshes: tuple[str, ...] = ()  #: files; they take part like objects, and alone where objects is empty
-    mesh_up: str = "y"
+    mesh_up: str = "y"  #: axis of mesh files that points up
     by_name: bool = False  #: paint, friction and bounce are functions of the body's name, not drawn; the cloth is red
-    background: str = "black"
-    depth: bool = False
+    background: str = "black"  #: colour behind the ground
+    depth: bool = False  #: whether depth images are written
     samples: int = 2  #: rays along each side of a pixel
     n_bodies: tuple[int, int] = (1, 1)  #: the first is the scene's object, others are any
     body_size: tuple[float, float] = (0.6, 0.76)  #: diameter of the sphere that holds the body
@@ -100,18 +100,18 @@ class World(ABC):
     lift: tuple[float, float] = (0.0, 0.0)  #: upward speed at the start, m/s
     spin: float = 1.2  #: largest, rad/s
     spread: float = 0.08  #: largest distance from the middle, along x and y, of the position aimed at
-    max_timestep: float = 1 / 480
-    distance: float = 2.6
+    max_timestep: float = 1 / 480  #: seconds, of the engine
+    distance: float = 2.6  #: of the cameras from the point they look at
     elevations: tuple[float, float] = (18.0, 42.0)  #: degrees, of the low and the high ring
-    target_height: float = 0.52
+    target_height: float = 0.52  #: of the point that cameras look at
     fov: float = 42.0  #: degrees
     camera_spread: float = 0.0  #: how much cameras differ from scene to scene, see rig(); 0: not at all
-    ground: bool = True
-    ground_height: tuple[float, float] = (0.0, 0.0)
-    ground_radius: float = 0.85
+    ground: bool = True  #: whether there is a ground
+    ground_height: tuple[float, float] = (0.0, 0.0)  #: of the ground
+    ground_radius: float = 0.85  #: of the round ground
     ground_albedo: float | None = None  #: grey of the whole ground; None: rings cut into sectors of three colours
-    near: float = 1.5
-    far: float = 3.8
+    near: float = 1.5  #: smallest depth that images show
+    far: float = 3.8  #: largest depth that images show
 
     name = ""
     engines = tuple(ENGINES)

@@ -64,7 +64,7 @@ def test_gradients_do_not_see_the_room(norm):
         assert_close_relative_to_max(given, exact, 1e-12)
 
 
-def test_rows_without_data_carry_finite_numbers_and_reach_nobody():
+def test_padding_rows_are_finite_and_unseen():
     dynamics, history = make_dynamics(), make_history((40, 30))
     pyramid, exact = with_room(dynamics, history, 4.0), dynamics.geometry(history)
     packed = dynamics.layout.pack(history)
@@ -91,7 +91,7 @@ def test_what_does_not_fit_changes_nothing():
     assert_same_bits(step.dynamic_latents, history.dynamic_latents[40:])
 
 
-def test_rows_that_nobody_sees_need_no_room():
+def test_invisible_rows_need_no_capacity():
     dynamics, history = make_dynamics(RELIT), some_asleep(make_history((400, 300, 200), frozen_share=0.8))
     assert dynamics.room(history) < 0.6 * history.n_rows
     assert make_dynamics(MOVING).room(history) == history.n_rows

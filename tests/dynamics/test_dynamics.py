@@ -78,7 +78,7 @@ def test_frozen_particles_take_no_gradient_into_the_prediction():
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -1.0, 1e6])
-def test_rows_outside_the_grid_sleep_and_nobody_sees_them(bad):
+def test_particles_outside_grid_sleep_unseen(bad):
     dynamics, history = make_dynamics(), make_history((25, 30))
     odd = torch.zeros(history.n_rows, dtype=torch.bool)
     odd[[3, 30, 54]] = True

@@ -1,4 +1,4 @@
-"""A background that is relit: seen as it was when the simulation began, and never moved away from that by errors."""
+"""A relightable background: read as it was when the simulation began, without accumulating errors."""
 
 import dataclasses
 

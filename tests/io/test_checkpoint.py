@@ -106,7 +106,7 @@ def test_a_broken_one_names_the_newest_that_is_whole(tmp_path):
 
 
 @pytest.mark.parametrize("room", [0, 100, 400])
-def test_a_full_disk_is_told_and_leaves_the_last_one_good(tmp_path, room):
+def test_full_disk_raises_and_keeps_last_checkpoint(tmp_path, room):
     """Files may not grow beyond ``room`` bytes."""
     checkpoint.save(tmp_path, example(5))
     before = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -331,13 +331,13 @@ def test_weights_learn_from_what_the_ground_does():
 
 def test_where_nothing_is_nothing_happens():
     history = ball(0.02)
-    nobody = history.select_rows(torch.zeros(history.n_rows, dtype=torch.bool))
-    assert make_dynamics(PUSHED)(nobody).means.shape == (0, 3)
+    none = history.select_rows(torch.zeros(history.n_rows, dtype=torch.bool))
+    assert make_dynamics(PUSHED)(none).means.shape == (0, 3)
     found = moves(ball(0.0, ground=False), onward=[0.0, 0.0, -0.05])
     assert_close_relative_to_max(found, torch.tensor([0.0, 0.0, -0.05]).expand_as(found), 1e-6)
 
 
-def test_what_is_hardly_seen_stops_nobody():
+def test_transparent_background_stops_no_particle():
     history = ball(0.02)
     moving, _ = moving_places(history)
     for opacity, stops in ((FIRM - 0.01, False), (FIRM + 0.01, True)):

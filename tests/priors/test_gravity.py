@@ -111,8 +111,8 @@ def test_scenes_do_not_see_each_other():
 
 def test_where_there_is_nothing_nothing_touches():
     history = ball(0.02)
-    nobody = history.select_rows(torch.zeros(history.n_rows, dtype=torch.bool))
-    assert make_dynamics(FLYING)(nobody).means.shape == (0, 3)
+    none = history.select_rows(torch.zeros(history.n_rows, dtype=torch.bool))
+    assert make_dynamics(FLYING)(none).means.shape == (0, 3)
     means = history.means.clone()
     means[-1], means[3] = torch.nan, torch.inf
     assert touch_of(dataclasses.replace(history, means=means)).isfinite().all()

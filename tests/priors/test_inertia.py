@@ -1,4 +1,4 @@
-"""Particles that carry their velocity, and the momentum of the matter around them."""
+"""Particles that carry their velocity, and the velocity field around them."""
 
 import dataclasses
 
@@ -116,7 +116,7 @@ def test_what_holds_some_rows_turns_the_body():
 
 
 def test_a_place_that_is_none_spoils_nothing():
-    """Neither what others are told nor a gradient."""
+    """Neither features of other particles nor a gradient."""
     history = flying()
     means = history.means.clone()
     means[250] = torch.nan
@@ -163,8 +163,8 @@ def test_without_turning_nothing_turns():
 def test_where_there_is_nothing_nothing_turns():
     """Nor where a place is none."""
     history = flying()
-    nobody = history.select_rows(torch.zeros(history.n_rows, dtype=torch.bool))
-    assert make_dynamics(TURNING)(nobody).orientations.shape == (0, 4)
+    none = history.select_rows(torch.zeros(history.n_rows, dtype=torch.bool))
+    assert make_dynamics(TURNING)(none).orientations.shape == (0, 4)
     means = history.means.clone()
     means[250] = torch.nan
     found = make_dynamics(TURNING)(dataclasses.replace(history, means=means)).orientations

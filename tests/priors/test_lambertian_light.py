@@ -23,7 +23,7 @@ TOWARDS = SLANTED[0] / SLANTED[0].norm()
 LIT = with_priors(TINY, LAMBERT, grid_size=CELL)
 
 
-def daylight(history, lights, cell, facing=None):
+def shaded(history, lights, cell, facing=None):
     """[N, L] twice, the irradiance and the cosine of the newest particles."""
     return lambert(Movable(history, cell), lights, cell, LAMBERT, facing)
 
@@ -51,7 +51,7 @@ def softened(cosine):
 @pytest.mark.parametrize("n", [600, 2000])
 def test_a_ball_is_lit_by_the_angle_between_its_surface_and_the_light(n):
     history = scene(n)
-    lit, facing = daylight(history, SLANTED, CELL)
+    lit, facing = shaded(history, SLANTED, CELL)
     _, (places, of_ball) = parts(history, torch.cat([lit, facing], 1))
     expected = softened(F.normalize(places, dim=1) @ TOWARDS)
     assert (of_ball[:, 1] - expected).abs().mean() < 0.03
@@ -63,7 +63,7 @@ def test_a_ball_is_lit_by_the_angle_between_its_surface_and_the_light(n):
 def test_a_shadow_falls_on_the_ground_where_the_light_does_not(light):
     light, history = torch.tensor([light]), scene()
     towards = light[0] / light.norm()
-    lit, facing = daylight(history, light, CELL)
+    lit, facing = shaded(history, light, CELL)
     (places, of_ground), _ = parts(history, torch.cat([lit, facing], 1))
     off = torch.linalg.cross(torch.tensor([0.0, 0.0, HEIGHT]) - places, towards.expand_as(places)).norm(dim=1)
     share = of_ground[:, 0] / of_ground[:, 1]
@@ -76,13 +76,13 @@ def test_a_sheet_shows_the_light_its_front():
     x, y = (v.flatten() for v in torch.meshgrid(ticks, ticks, indexing="ij"))
     history = opaque(make_history((len(x),), frozen_share=0.0))
     history = dataclasses.replace(history, means=torch.stack([1 + x, 1 + y, 1 + 0 * x], 1))
-    lit, facing = daylight(history, SLANTED, CELL)
+    lit, facing = shaded(history, SLANTED, CELL)
     assert_close_relative_to_max(facing[:, 0], softened(TOWARDS[2]).expand(len(x)), 0.01)
     assert (lit / facing).min() > 0.9
 
 
 def test_many_rows_stand_in_the_light_as_few_do():
-    few, many = (parts(h, daylight(h, SLANTED, CELL)[0])[0][1] for h in (scene(700), scene(4000)))
+    few, many = (parts(h, shaded(h, SLANTED, CELL)[0])[0][1] for h in (scene(700), scene(4000)))
     assert (few - many).abs().mean() < 0.02 and few.min() < 0.3
 
 
@@ -95,17 +95,17 @@ def test_what_rests_or_is_transparent_casts_no_shadow():
             activity=torch.where(moves, activity, over.activity).to(torch.uint8),
             opacities=torch.where(moves, opacity, over.opacities),
         )
-        lit, facing = daylight(changed, SLANTED, CELL)
+        lit, facing = shaded(changed, SLANTED, CELL)
         assert_same_bits(lit, facing)
 
 
 def test_what_is_known_of_rows_that_rest_is_kept():
     history = scene()
-    lit, facing = daylight(history, SLANTED, CELL)
-    again = daylight(history, SLANTED, CELL, facing=facing)
+    lit, facing = shaded(history, SLANTED, CELL)
+    again = shaded(history, SLANTED, CELL, facing=facing)
     assert_same_bits(again[0], lit)
     moves = last_steps(history, 1).activity == DYNAMIC
-    half = daylight(history, SLANTED, CELL, facing=0.5 * facing)
+    half = shaded(history, SLANTED, CELL, facing=0.5 * facing)
     assert_close_relative_to_max(half[0][~moves], 0.5 * lit[~moves], 1e-6)
     assert_same_bits(half[0][moves], lit[moves])
 
@@ -115,11 +115,11 @@ def test_turning_the_light_changes_it_as_its_gradient_says():
     history = dataclasses.replace(history, means=history.means.double())
     light = torch.tensor([[0.2, 0.1, 0.5]], dtype=torch.float64, requires_grad=True)
     weights = torch.rand(last_steps(history, 1).n_rows, 1, dtype=torch.float64)
-    _, known = daylight(history, light.detach(), CELL)
+    _, known = shaded(history, light.detach(), CELL)
 
     def total(x):
         """Of the ground: where rays of the ball begin is no function of the light to the gradient."""
-        lit = daylight(history, x, CELL, facing=known)[0]
+        lit = shaded(history, x, CELL, facing=known)[0]
         return (lit * weights)[last_steps(history, 1).activity == FROZEN].sum()
 
     (gradient,) = torch.autograd.grad(total(light), [light])
@@ -132,17 +132,17 @@ def test_turning_the_light_changes_it_as_its_gradient_says():
 
 def test_scenes_do_not_see_each_other_and_rows_have_no_order():
     one, other = scene(200), opaque(make_history((7, 50), seed=1))
-    both = torch.cat(daylight(batch([one, other]), SLANTED, CELL), 1)
-    alone = torch.cat([torch.cat(daylight(q, SLANTED, CELL), 1) for q in (one, other)])
+    both = torch.cat(shaded(batch([one, other]), SLANTED, CELL), 1)
+    alone = torch.cat([torch.cat(shaded(q, SLANTED, CELL), 1) for q in (one, other)])
     assert_close_relative_to_max(both, alone, 2e-3)  # the normals of a few rows without order depend on rounding
     shuffled, order = permute_rows(one)
     newest = order[one.cu_rows[-2] :] - one.cu_rows[-2]
-    assert_close_relative_to_max(daylight(shuffled, SLANTED, CELL)[0], daylight(one, SLANTED, CELL)[0][newest], 2e-3)
+    assert_close_relative_to_max(shaded(shuffled, SLANTED, CELL)[0], shaded(one, SLANTED, CELL)[0][newest], 2e-3)
 
 
 @pytest.mark.parametrize("n_rows", [(0, 50), (1, 1)])
 def test_where_nothing_moves_nothing_is_in_the_way(n_rows):
-    lit, facing = daylight(opaque(make_history(n_rows, frozen_share=1.0)), SLANTED, CELL)
+    lit, facing = shaded(opaque(make_history(n_rows, frozen_share=1.0)), SLANTED, CELL)
     assert lit.shape == facing.shape == (n_rows[-1], 1)
     assert_same_bits(lit, facing)
 
@@ -151,7 +151,7 @@ def test_no_number_it_cannot_use_gets_out():
     history = scene()
     means = history.means.clone()
     means[-1], means[-5], means[-2200] = torch.nan, torch.inf, torch.nan
-    for found in daylight(dataclasses.replace(history, means=means), SLANTED, CELL):
+    for found in shaded(dataclasses.replace(history, means=means), SLANTED, CELL):
         assert found.isfinite().all() and found.any()
 
 
@@ -160,22 +160,22 @@ def test_a_row_without_neighbours_has_a_light():
     history = scene()
     means = history.means.clone()
     means[-3:] += torch.tensor([[5.0, 0.0, 0.0], [0.0, 7.0, 0.0], [0.0, 0.0, 9.0]])
-    lit, facing = daylight(dataclasses.replace(history, means=means), SLANTED, CELL)
+    lit, facing = shaded(dataclasses.replace(history, means=means), SLANTED, CELL)
     assert (lit >= 0).all() and (facing <= 1).all() and facing.isfinite().all()
 
 
 def test_a_gpu_finds_the_same(devices):
     history = batch([scene(600), opaque(make_history((30, 40)))])
-    expected, actual = (torch.cat(daylight(history.to(d), SLANTED.to(d), CELL), 1).cpu() for d in devices)
+    expected, actual = (torch.cat(shaded(history.to(d), SLANTED.to(d), CELL), 1).cpu() for d in devices)
     assert (actual - expected).abs().mean() < 1e-3
-    assert_same_bits(torch.cat(daylight(history.to(devices[1]), SLANTED.to(devices[1]), CELL), 1).cpu(), actual)
+    assert_same_bits(torch.cat(shaded(history.to(devices[1]), SLANTED.to(devices[1]), CELL), 1).cpu(), actual)
 
 
 def test_compiled_it_is_the_same(device):
     history, lights = scene(50).to(device), SLANTED.to(device)
     history.clouds
-    compiled = torch.compile(daylight, fullgraph=True)
-    for actual, expected in zip(compiled(history, lights, CELL), daylight(history, lights, CELL)):
+    compiled = torch.compile(shaded, fullgraph=True)
+    for actual, expected in zip(compiled(history, lights, CELL), shaded(history, lights, CELL)):
         assert_close_relative_to_max(actual, expected, 1e-3)
 
 
@@ -189,7 +189,7 @@ def test_colours_follow_the_light(background):
     newest = last_steps(known, 1)
     lit, facing, now = newest.light_occlusion.split(2, 1)
     assert_same_bits(lit, now)
-    found = daylight(history, light_of(dynamics).directions, CELL)
+    found = shaded(history, light_of(dynamics).directions, CELL)
     assert_close_relative_to_max(lit, found[0], 1e-6)
     assert_close_relative_to_max(facing, found[1], 1e-6)
     assert (known.light_occlusion[: -newest.n_rows] == -1).all()
@@ -200,7 +200,7 @@ def test_colours_follow_the_light(background):
     step = dynamics(moved)
     then, now = (
         (1 + values @ strength)
-        for values in (lit, daylight(moved, light_of(dynamics).directions, CELL, facing=facing)[0])
+        for values in (lit, shaded(moved, light_of(dynamics).directions, CELL, facing=facing)[0])
     )
     assert_close_relative_to_max(step.irradiance_gain, now / then, 1e-4)
     assert step.irradiance_gain[~moves].min() < 0.6 and step.irradiance_gain[~moves].max() > 1.5
@@ -258,6 +258,6 @@ def test_rows_that_were_not_encoded_are_lit_as_where_they_begin():
     step = dynamics(history)
     assert (step.irradiance_gain - 1).abs().max() < 1e-5
     assert_close_relative_to_max(
-        step.light_occlusion[:, :2], daylight(history, light_of(dynamics).directions, CELL)[0], 0.3
+        step.light_occlusion[:, :2], shaded(history, light_of(dynamics).directions, CELL)[0], 0.3
     )
     assert (step.light_occlusion >= 0).all()

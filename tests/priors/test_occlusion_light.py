@@ -1,4 +1,4 @@
-"""What stands in the light of a particle, and a network that is told of it."""
+"""Light occlusion of particles, and a network that reads it."""
 
 import copy
 import dataclasses
@@ -152,7 +152,7 @@ def test_compiled_it_is_the_same(device):
 
 
 def test_the_network_reads_it_and_turns_its_lights():
-    """Without the columns that read it the next step is another one. Training is told by how a step is lit."""
+    """Without the columns that read it the next step is another one. Training gets the irradiance of a step."""
     dynamics, history = make_dynamics(LIT), under_a_ball(100)
     torch.nn.init.normal_(light_of(dynamics).in_proj.weight)
     torch.nn.init.normal_(light_of(dynamics).gain_head.weight)
@@ -167,7 +167,7 @@ def test_the_network_reads_it_and_turns_its_lights():
         assert (other(history).dynamic_latents - step.dynamic_latents).abs().max() > 1e-5
 
 
-def unlit(n_rows, n_lights=2):
+def without_light(n_rows, n_lights=2):
     return torch.zeros(n_rows, n_lights)
 
 
@@ -178,7 +178,7 @@ def test_light_is_that_of_where_rows_are_over_that_of_where_they_were_encoded(ba
     light_of(dynamics).extinction.data = torch.tensor([[0.3, 0.2, 0.1], [0.0, 0.1, 0.2]])
     shaded = shade(history, torch.tensor(LIGHTS), LIT.grid_size)
     assert shaded.amin(0).max() < 0.1 and shaded.amax(0).min() > 2
-    began = 0.5 + unlit(history.n_rows)
+    began = 0.5 + without_light(history.n_rows)
     step = dynamics(dynamics.initialize(dataclasses.replace(history, light_occlusion=began)))
     expected = (2 * (((0.5 - shaded) @ light_of(dynamics).extinction) / 2).tanh()).exp()
     assert_close_relative_to_max(step.irradiance_gain, expected, 1e-5)
@@ -198,7 +198,7 @@ def test_light_does_not_add_up_and_is_not_of_rows_that_keep_their_look():
     held = torch.zeros(history.n_rows, dtype=torch.bool)
     held[::3] = True
     history = dynamics.initialize(
-        dataclasses.replace(history, light_occlusion=0.5 + unlit(history.n_rows), frozen_appearance=held)
+        dataclasses.replace(history, light_occlusion=0.5 + without_light(history.n_rows), frozen_appearance=held)
     )
     for who in ("all", "dynamic", "frozen", "none"):
         first, *_, last = rollout(partial(dynamics, changes=dynamics.layout.changes(who)), history, 3, 2)
@@ -234,7 +234,7 @@ def test_asymmetric_background_is_refused():
 
 @pytest.mark.parametrize("light", [OCCLUSION, LAMBERT], ids=["occlusion", "lambert"])
 def test_a_shadow_does_not_lag_behind_its_body(light):
-    """A step is lit as its rows are where it ends, and the next one is told that."""
+    """A step is lit as its rows are where it ends, and the next step reads that."""
     config = with_priors(LIT, light, grid_size=CELL, zero_init=True)
     dynamics, history = make_dynamics(config), under_a_ball()
     names = [name for name, n in dynamics.layout.outputs for _ in range(n)]

@@ -1,4 +1,4 @@
-"""The way from what moves to what rests near it, and a network that is told of it."""
+"""The way from movable particles to the static background, and a network that reads it."""
 
 import dataclasses
 
@@ -43,14 +43,14 @@ def above_ground(heights, seed=0, slope=0.0, n_steps=2):
     )
 
 
-def told(history, heights):
+def features(history, heights):
     way, near = contact(history)[-len(heights) :].split([3, 1], 1)
     return way / near * LENGTH, near
 
 
 def test_over_a_plane_it_is_the_height_and_fades():
     heights = [0.02, 0.1, 0.2, 0.4]
-    way, near = told(above_ground(heights), heights)
+    way, near = features(above_ground(heights), heights)
     height = torch.tensor(heights)
     assert_close_relative_to_max(way[:, 2], -height, 0.01)
     assert way[:, :2].abs().max() < 0.01
@@ -58,18 +58,18 @@ def test_over_a_plane_it_is_the_height_and_fades():
 
 
 def test_below_it_is_the_way_back():
-    way, near = told(above_ground([-0.06]), [-0.06])
+    way, near = features(above_ground([-0.06]), [-0.06])
     assert abs(float(way[0, 2]) - 0.06) < 0.003 and near > 0.9
 
 
 def test_of_a_slope_it_is_the_normal():
     slope, height = 0.5, 0.1
-    way, _ = told(above_ground([height], slope=slope), [height])
+    way, _ = features(above_ground([height], slope=slope), [height])
     normal = torch.tensor([slope, 0.0, -1.0]) / (1 + slope**2) ** 0.5
     assert_close_relative_to_max(way[0], normal * height / (1 + slope**2) ** 0.5, 0.1)
 
 
-def test_what_is_transparent_or_far_or_rests_is_told_of_nothing():
+def test_transparent_far_or_frozen_particles_have_no_proximity():
     history = above_ground([0.1, 3.0])
     found = contact(history)
     frozen = last_steps(history, 1).activity == FROZEN
@@ -138,7 +138,7 @@ def test_waves_tell_places():
         assert_close_relative_to_max(waves[:, k, 1], angles.cos(), 1e-6)
 
 
-def test_beside_the_background_of_the_newest_step_it_is_the_same_when_relit():
+def test_newest_background_matches_relightable_background():
     relit = with_priors(TOLD, InertiaConfig(radius=0.2), background="relightable")
     dynamics, history = make_dynamics(relit), above_ground([0.02, 0.05])
     older = (history.activity == FROZEN) & (history.row_cloud() == 0)

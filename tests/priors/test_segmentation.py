@@ -54,15 +54,15 @@ def scene(*parts, seed=0):
     return dataclasses.replace(history, means=places[order], origin=torch.zeros(1, 3).double()), part[order]
 
 
-def told_apart(history):
+def distinguished(history):
     """The middles that rows know, and the number of that of each."""
     return bodies(history).unique(dim=0, return_inverse=True)
 
 
-def test_bodies_with_a_gap_between_them_are_told_apart():
+def test_bodies_with_a_gap_are_distinguished():
     """Of 6 cm, where rows are 2 cm apart."""
     history, part = scene(shell(0.2, (1.0, 1.0, 1.0), 900), shell(0.15, (1.41, 1.0, 1.0), 500, seed=1))
-    middles, body = told_apart(history)
+    middles, body = distinguished(history)
     assert len(middles) == 2
     for k in range(2):
         assert (body[part == k] == body[part == k][0]).all()
@@ -70,26 +70,26 @@ def test_bodies_with_a_gap_between_them_are_told_apart():
 
 
 def test_a_body_with_a_hole_is_one():
-    middles, _ = told_apart(scene(tube(0.22, 0.07, (1.0, 1.0, 1.0), 900))[0])
+    middles, _ = distinguished(scene(tube(0.22, 0.07, (1.0, 1.0, 1.0), 900))[0])
     assert len(middles) == 1
 
 
 def test_a_small_part_and_rows_that_are_alone_belong_to_what_is_nearest():
     g = generator()
     dust, lump = 1.0 + 0.4 * torch.randn(20, 3, generator=g), shell(0.03, (1.35, 1.0, 1.0), int(0.3 * MIN_SHARE * 600))
-    middles, body = told_apart(scene(shell(0.2, (1.0, 1.0, 1.0), 600), lump, dust)[0])
+    middles, body = distinguished(scene(shell(0.2, (1.0, 1.0, 1.0), 600), lump, dust)[0])
     assert len(middles) == 1 and not body.any()
 
 
 def test_a_part_of_some_size_is_a_body():
     lump = shell(0.06, (1.4, 1.0, 1.0), int(2 * MIN_SHARE * 600))
-    assert len(told_apart(scene(shell(0.2, (1.0, 1.0, 1.0), 600), lump)[0])[0]) == 2
+    assert len(distinguished(scene(shell(0.2, (1.0, 1.0, 1.0), 600), lump)[0])[0]) == 2
 
 
 def test_many_rows_are_sampled():
     parts = [shell(0.2, (1.0, 1.0, 1.0), 2 * SAMPLES), shell(0.2, (1.55, 1.0, 1.0), 2 * SAMPLES, seed=1)]
     history, part = scene(*parts)
-    middles, body = told_apart(history)
+    middles, body = distinguished(history)
     assert len(middles) == 2 and (body[part == 0] == body[part == 0][0]).all()
     assert (body[part == 1] != body[part == 0][0]).all()
 
@@ -97,7 +97,7 @@ def test_many_rows_are_sampled():
 @pytest.mark.parametrize("n", [1, NEIGHBORS - 1, NEIGHBORS])
 def test_few_rows_are_one_body(n):
     history, _ = scene(1.0 + 0.3 * torch.rand(n, 3, generator=generator()))
-    assert len(told_apart(history)[0]) == 1
+    assert len(distinguished(history)[0]) == 1
 
 
 def test_rows_that_do_not_move_know_where_they_are_and_are_not_looked_at():

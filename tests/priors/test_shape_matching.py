@@ -1,4 +1,4 @@
-"""What rows remember of the shape that bodies had, and what they are told of it."""
+"""Rest shapes of bodies, and the features that the network reads of them."""
 
 import dataclasses
 import math
@@ -73,7 +73,7 @@ def test_a_body_that_moves_and_turns_is_not_bent(degrees):
 
 
 @pytest.mark.parametrize("turn", [torch.eye(3), QUARTER])
-def test_a_squeezed_body_is_told_the_way_back(turn):
+def test_squeezed_body_residual_points_to_rest_shape(turn):
     """In a window that is larger than the body, so that all of it counts."""
     history = bent(turn @ SQUEEZED)
     way = residual(history, 1.0)
@@ -81,7 +81,7 @@ def test_a_squeezed_body_is_told_the_way_back(turn):
     assert_close_relative_to_max(way, expected - expected.mean(0), 0.05)
 
 
-def test_in_a_window_of_its_size_it_is_told_part_of_it():
+def test_residual_in_window_of_body_size():
     history = bent(SQUEEZED)
     way = residual(history, 0.05)
     top = history.rest_positions[:, 2] > 1.08

@@ -223,7 +223,7 @@ class Walker {
     touched_.push_back(place);
   }
 
-  // The border collects what nobody asks for.
+  // The border collects what is not asked for.
   void add_grad(int32_t place, T grad) {
     if (stamp_[place] < epoch_) {
       stamp_[place] = epoch_;

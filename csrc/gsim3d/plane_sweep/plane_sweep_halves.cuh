@@ -43,7 +43,7 @@ __global__ void __launch_bounds__(512) largest_kernel(const float* __restrict__ 
   if (threadIdx.x == 0) largest[blockIdx.x] = own;
 }
 
-// A block takes 32 channels of a tile of [n_images, channels, n_pixels]. tiles: null where nobody wants them.
+// A block takes 32 channels of a tile of [n_images, channels, n_pixels]. tiles: null where they are not wanted.
 __global__ void __launch_bounds__(kTileThreads)
     to_halves_kernel(const float* __restrict__ features, int64_t channels, TileSizes s,
                      const uint32_t* largest /* still written when this begins */, float* __restrict__ inverses,

@@ -56,7 +56,7 @@ struct RasterScene {
 enum RasterFault : int64_t {
   kFaultMeans = 1,        // not finite, or beyond kLargest
   kFaultQuats = 2,        // not finite
-  kFaultScales = 4,       // likewise, or negative
+  kFaultScales = 4,       // the same, or negative
   kFaultOpacities = 8,    // not in [0, 1]
   kFaultColor = 16,       // not finite, or beyond kLargest
   kFaultFeatures = 32,    // not finite, or beyond kLargest
@@ -84,7 +84,7 @@ struct RasterImages {
   T* depth;          // [n_images, height, width] sum of weight * camera z, metres
   T* features;       // [n_images, height, width, n_features]
   T* transmittance;  // [n_images, height, width] T_end, kept for the backward pass
-  int32_t* last;     // [n_images, height, width] entries of the tile's list in front of the pixel's end; kept likewise
+  int32_t* last;     // [n_images, height, width] entries of the tile's list in front of the pixel's end; kept the same way
   int64_t* unusable;  // [n_images, 2] how many rows were left out, and row << 9 | faults of the first, -1: none. Null:
                       // not wanted
 };

@@ -146,7 +146,7 @@ template <typename T, bool kWithFeatures>
 struct BlendShared {
   Batch<T> batch;
   Record<T> records[kWarp];  // of the next batch; a lane reads its own
-  uint32_t pairs[kWarp];     // of the batch after it, likewise
+  uint32_t pairs[kWarp];     // of the batch after it, the same
   T features[kWithFeatures ? kFeatures : 1][kWarp];
 };
 

@@ -20,11 +20,11 @@ struct alignas(2 * sizeof(T)) SlotSums {
 template <typename T>
 struct Slots {
   SlotSums<T>* sums;    // [slots], unset where not live
-  T* features;          // [slots, n_features], likewise
+  T* features;          // [slots, n_features], the same
   unsigned char* live;  // [slots] 1 where a pixel may have seen the entry
   SlotSums<T>* unfinished;  // [n_rows] sums of an image's tiles in earlier groups
   T* backgrounds;       // [n_images * n_tiles * kQuarters, 3]
-  T* viewmats;          // [n_images, kViewmatParts, 12], or null when nobody asks for them
+  T* viewmats;          // [n_images, kViewmatParts, 12], or null when they are not asked for
 };
 
 // What one pixel tells one entry: the gradient v of the exponent, and the weight of the entry's values.

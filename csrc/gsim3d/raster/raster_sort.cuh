@@ -38,7 +38,7 @@ __device__ void sort_by_network(Entry<T>* shared, int n) {
   }
 }
 
-// What entries are told apart by first: the highest bits of their keys, or where those are equal the lowest.
+// What distinguishes entries first: the highest bits of their keys, or where those are equal the lowest.
 __device__ __forceinline__ uint32_t digit_of(const Entry<float>& entry, bool equal) {
   return static_cast<uint32_t>(equal ? entry.key : entry.key >> 32);
 }

@@ -3,7 +3,8 @@
 ``|mean_a - mean_b|^2 + tr(C_a + C_b - 2 (C_a C_b)^(1/2))`` over the 400 logits of I3D (Kinetics-400), the Frechet
 distance between two Gaussians fitted to them.
 
-Source: Unterthiner et al. 2018, "Towards accurate generative models of video: a new metric and challenges".
+Source:
+    Unterthiner et al. 2018, "Towards accurate generative models of video: a new metric and challenges".
 """
 
 from __future__ import annotations

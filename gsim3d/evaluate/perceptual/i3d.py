@@ -3,7 +3,8 @@
 Batch norms are folded into the convolutions before them when the weights are converted (weights.py), so every unit is
 a convolution, a bias and a ReLU.
 
-Source: Carreira and Zisserman 2017, "Quo vadis, action recognition? A new model and the Kinetics dataset".
+Source:
+    Carreira and Zisserman 2017, "Quo vadis, action recognition? A new model and the Kinetics dataset".
 """
 
 from __future__ import annotations

@@ -4,7 +4,8 @@ Images go through a classifier's convolutions; at five layers the features of ea
 squared difference of the two images' features is weighted by channel (the learned 1x1 head), averaged over pixels,
 and summed over layers. Version 0.1 of the weights.
 
-Source: Zhang et al. 2018, "The unreasonable effectiveness of deep features as a perceptual metric".
+Source:
+    Zhang et al. 2018, "The unreasonable effectiveness of deep features as a perceptual metric".
 """
 
 from __future__ import annotations
