@@ -4,8 +4,8 @@ A row is quiet after ``patience`` steps in which it changed by no more than ``ep
 sleeps once all its rows are quiet: scenes do not see each other. By "approx" space is cut into cubes with edges of
 ``halo`` metres. A cube sleeps while no row that is restless is in it or in one of its 26 neighbours, or will be in the
 next step if it moves on as in the last; else it wakes at once. A row that moves by less than ``halo`` a step, or
-steadily, meets no sleeping row. Which rows fall asleep is decided every ``patience`` steps only, since others asleep make
-another background. Rows asleep are a background to those awake, so "approx" needs a model of
+steadily, meets no sleeping row. Which rows fall asleep is decided every ``patience`` steps only, since other sleepers
+make another background. Sleeping rows are a background to the others, so "approx" needs a model of
 ``background="asymmetric"``.
 
 A row that sleeps misses changes of up to ``eps`` a step. Where a simulation that never sleeps would change no row of a

@@ -2,7 +2,8 @@
 
 Stem, then encoder stages that pool space and merge time, then decoder stages that go back to the rows of stage 0. All
 geometry (neighbours, patches, clusters) comes from a :class:`gsim3d.ops.Pyramid`; this file holds features and weights.
-Source: Point Transformer V3 (Wu et al. 2024), time merging of 3DGSim.
+Source:
+    Point Transformer V3 (Wu et al. 2024), time merging of 3DGSim.
 """
 
 from __future__ import annotations
