@@ -15,6 +15,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import dataclasses
+import functools
 import gc
 import math
 from collections.abc import Callable, Iterator
@@ -25,7 +26,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from gsim3d.cameras import Cameras
-from gsim3d.dynamics import FrozenContext, Partition
+from gsim3d.dynamics import FrozenContext, Partition, rollout
 from gsim3d.effects.plan import Plan
 from gsim3d.errors import CaptureError, InputError
 from gsim3d.nn.point_transformer import SparseConv
@@ -207,7 +208,7 @@ class CapturedRollout:
         self.captures = 0
         self._launched = self._is_stale = False
         if simulator.config.dynamics.is_asymmetric:
-            parts = simulator._parts(prepared, report=self._report)
+            parts = self._partition(prepared)
             if parts.nothing_moves:
                 raise InputError("CapturedRollout: state has no particle that moves; there is nothing to capture")
             self._state = _own(parts.moving)
@@ -239,7 +240,7 @@ class CapturedRollout:
         self._check(state, self._table)
         tables, self._world_offset = state.clouds, state.world_offset
         if self._frozen is not None:
-            state = self._load_parts(self._simulator._parts(state, report=self._report))
+            state = self._load_parts(self._partition(state))
         _copy(self._state, state)
         if cameras is not None:
             self._load(cameras)
@@ -285,12 +286,24 @@ class CapturedRollout:
             if frozen is None:
                 steps = self._model.rollout(self._state, self._n_steps, plan, **options)
             else:
-                moving = self._model._advance(self._state, frozen.context, self._n_steps, plan, **options)
+                moving = self._advance(frozen.context, plan, **options)
                 steps = [frozen.partition.whole(step, 1 + i) for i, step in enumerate(moving)]
             if self._cameras is not None:
                 drawn = {"plan": self._drawn, "cutoff": self._cutoff, "report": report}
                 renderings += [self._model._draw(step, self._cameras, self._background, **drawn) for step in steps]
         return Prediction(steps, renderings)
+
+    def _partition(self, prepared: Particles) -> Partition:
+        """Movable and frozen particles of a state, for a model with an asymmetric background."""
+        validated = self._simulator._guard("rollout", None, self._report)(prepared)
+        return Partition.of(validated, asymmetric=True)
+
+    def _advance(self, context: FrozenContext, plan: Plan, geometry, report: StabilityReport) -> list[Particles]:
+        """The rollout of the movable particles alone."""
+        guard = self._model._guard("rollout", None, report)
+        options = {"plan": plan, "generator": None, "guard": guard, "geometry": geometry, "background": context}
+        predict = functools.partial(self._model._predict, **options)
+        return rollout(predict, self._state, self._n_steps, plan.history)
 
     def _autocast(self) -> torch.autocast:
         return torch.autocast(self._device.type, self._dtype, enabled=self._dtype is not None, cache_enabled=False)

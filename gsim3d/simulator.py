@@ -16,7 +16,7 @@ model's), and ``report``, which counts them (default ``simulator.report``).
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -24,13 +24,11 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from gsim3d import pretrained
-from gsim3d.cameras import Cameras, Frames, FrameSource, InputSpec
-from gsim3d.cuda_graphs import CapturedRollout, Prediction
+from gsim3d.cameras import Cameras, Frames, FrameSource
+from gsim3d.cuda_graphs import Prediction
 from gsim3d.dynamics import (
     Dynamics,
     FrozenContext,
-    Partition,
     RestLog,
     Sleepers,
     append_step,
@@ -40,22 +38,21 @@ from gsim3d.dynamics import (
     rollout_in_parts,
 )
 from gsim3d.effects.edits import Edit, by_step
-from gsim3d.effects.plan import Plan, make_plan, unused_parameters
+from gsim3d.effects.plan import Plan, by_plan, make_plan, unused_parameters
 from gsim3d.effects.selection import any_mask
 from gsim3d.effects.spec import EffectsSpec, OutputEffects, UnsupportedEffect
 from gsim3d.errors import InputError
-from gsim3d.io import checkpoint
 from gsim3d.math.spherical_harmonics import SH_0
 from gsim3d.nn.gaussian_head import GaussianHead, render
 from gsim3d.nn.multiview_encoder import Encoder, StaticShapes, pixel_rows
 from gsim3d.numerics.policy import OnInvalid, check_on_invalid
 from gsim3d.numerics.report import StabilityReport
-from gsim3d.numerics.speed import Setting, load_speed
+from gsim3d.numerics.speed import Setting, predict
 from gsim3d.numerics.validate import check_particles, drop_particles, validate_frames, validate_particles
 from gsim3d.ops.curve import Pyramid
 from gsim3d.ops.raster import Rendering
 from gsim3d.presets import ModelConfig
-from gsim3d.pretrained.loading import Description, check_device, describe, is_released, with_weights
+from gsim3d.pretrained import loading
 from gsim3d.state import DYNAMIC, FROZEN, Gaussians, Particles
 
 
@@ -100,27 +97,7 @@ class Simulator(nn.Module):
             InputError: there is no such checkpoint, it is broken or one of the published model, ``device`` is not
                 there, or ``speed`` was not tuned; the message says what to do.
         """
-        check_device(device)
-        saved = checkpoint.load(name_or_path)
-        if is_released(saved.config) != (cls.config_class is not ModelConfig):
-            wanted = "gsim3d.compat.load_released" if cls is Simulator else "Simulator.from_pretrained"
-            raise InputError(f"{name_or_path}: a checkpoint of another kind of model; load it with {wanted}")
-        try:
-            found = describe(saved.config, cls.config_class, pretrained.frame_rate(name_or_path))
-            folder = pretrained.located(name_or_path)
-            folder = folder if folder.is_dir() else folder.parent
-            setting = load_speed(folder, saved.digest, device.split(":")[0], speed)
-            simulator = with_weights(cls, setting.of_model(found.model), found.effects, saved.weights)
-        except InputError as error:
-            raise InputError(f"{name_or_path}: {error}") from None
-        except Exception as error:  # a configuration that describes no model raises anything
-            said = " ".join(str(error).split())[:200]
-            kind = type(error).__name__
-            raise InputError(f"{name_or_path}: its configuration describes no model: {kind}: {said}") from None
-        asymmetric = simulator.config.dynamics.is_asymmetric
-        simulator.effects, simulator.setting = setting.of_effects(found.effects, asymmetric), setting
-        simulator.inputs = setting.of_inputs(found.inputs)
-        return simulator.eval().to(device)
+        return loading.load(cls, name_or_path, device, speed)
 
     def save_pretrained(self, folder: str | Path) -> Path:
         """Writes weights and configuration, for :meth:`from_pretrained`.
@@ -130,12 +107,10 @@ class Simulator(nn.Module):
         Returns:
             The folder.
         Raises:
+            InputError: there is something else at this path; nothing is written.
             NumericalError: a weight is not finite; nothing is written.
         """
-        config = Description(self.config, self.effects, self.inputs).to_dict()
-        folder = Path(folder)
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        return checkpoint.write(folder, checkpoint.Checkpoint(self.state_dict(), config, {"step": 0}))
+        return loading.save(self, Path(folder))
 
     @torch.no_grad()
     def predict(
@@ -162,36 +137,7 @@ class Simulator(nn.Module):
             InputError: ``steps`` is below 1, the images have another size than those of the training, or an edit cannot
                 be made.
         """
-        if steps < 1:
-            raise InputError(f"predict: steps must be at least 1; got {steps}")
-        inputs = InputSpec() if self.inputs is None else self.inputs
-        frames = source if isinstance(source, Frames) else source.input_frames(inputs)
-        size = (frames.cameras.width, frames.cameras.height)
-        if inputs.image_size and size != tuple(inputs.image_size):
-            wanted = "x".join(map(str, inputs.image_size))
-            raise InputError(f"predict: images must be of {wanted} pixels, as in training; got {size[0]}x{size[1]}")
-        weight = next(self.parameters())
-        setting, plan, device = self.setting, self.plan(), weight.device.type
-        frames = frames.subsample(inputs.background_stride, inputs.body_stride).to(weight.device)
-        with setting.precision("encoder", device):
-            state = setting.retained(self.encode(frames))
-        with setting.precision("dynamics", device):
-            states = self._states(state, steps, plan, edits)
-        renderings = []
-        if cameras is not None:
-            seen = states
-            if setting.least_opacity:
-                seen = [step.select_rows(step.opacities >= setting.least_opacity) for step in states]
-            shown = cameras.to(weight.device)
-            with setting.precision("renderer", device):
-                renderings = [self._draw(step, shown, background, plan, cutoff=setting.cutoff) for step in seen]
-        return Prediction(states, renderings)
-
-    def _states(self, state: Particles, n_steps: int, plan: Plan, edits: Sequence[Edit]) -> list[Particles]:
-        """:meth:`rollout` as the setting says."""
-        if self.setting.captured and not edits and state.means.is_cuda:
-            return CapturedRollout(self, state, n_steps, plan)(state).steps
-        return self.rollout(state, n_steps, plan, edits=edits)
+        return predict(self, source, steps, cameras, background, edits)
 
     def encode(
         self,
@@ -317,7 +263,7 @@ class Simulator(nn.Module):
             options = {"generator": generator, "on_invalid": on_invalid, "report": report, "edits": edits, "log": log}
             parts = [
                 self.rollout(state.select_clouds(clouds), n_steps, one, geometry=geometry, wrap=wrap, **options)
-                for one, clouds in _by_plan(state, plans)
+                for one, clouds in by_plan(state, plans)
             ]
             return [concatenate(step) for step in zip(*parts, strict=True)]
         plan, guard = plan or self.plan(), self._guard("rollout", on_invalid, report)
@@ -373,27 +319,6 @@ class Simulator(nn.Module):
             state = dataclasses.replace(state, activity=torch.where(state.activity == FROZEN, DYNAMIC, state.activity))
         state = last_steps(state, plan.history)
         return self.dynamics.begin(self.dynamics.initialize(state))
-
-    def _parts(
-        self, prepared: Particles, *, on_invalid: OnInvalid | None = None, report: StabilityReport | None = None
-    ) -> Partition:
-        """What moves and what rests of a state of :meth:`_prepare`, for a model with an asymmetric background."""
-        return Partition.of(self._guard("rollout", on_invalid, report)(prepared), asymmetric=True)
-
-    def _advance(
-        self,
-        moving: Particles,
-        background: FrozenContext,
-        n_steps: int,
-        plan: Plan,
-        *,
-        report: StabilityReport | None = None,
-        geometry: Callable[[Particles], Pyramid] | None = None,
-    ) -> list[Particles]:
-        """As :meth:`rollout`, of what moves alone, beside a background of ``dynamics.remember``."""
-        guard = self._guard("rollout", None, report)
-        options = {"plan": plan, "generator": None, "guard": guard, "geometry": geometry, "background": background}
-        return rollout(partial(self._predict, **options), moving, n_steps, plan.history)
 
     def render(
         self,
@@ -468,7 +393,7 @@ class Simulator(nn.Module):
         if len({plan.spec.outputs for plan in plans}) > 1:
             raise InputError("plans: those of one batch must ask for the same images (outputs)")
         shown, order, images = cameras.image_cloud.tolist(), [], []
-        for plan, clouds in _by_plan(particles, plans):
+        for plan, clouds in by_plan(particles, plans):
             rows = [i for i, cloud in enumerate(shown) if cloud in clouds]
             chosen = torch.tensor(rows, device=cameras.near.device, dtype=torch.int64)
             image_cloud = torch.tensor([clouds.index(shown[i]) for i in rows], device=chosen.device, dtype=torch.int64)
@@ -538,14 +463,3 @@ class Simulator(nn.Module):
         newest = concatenate([last_steps(state, 1)] * self.config.dynamics.steps_per_call)
         changed = [name for name, who in changes.items() if who != "none"]
         return guard(step, previous=newest, changed=changed)
-
-
-def _by_plan(particles: Particles, plans: Sequence[Plan]) -> Iterator[tuple[Plan, list[int]]]:
-    """Each plan, once, and the clouds that it is for."""
-    n_scenes = particles.origin.shape[0]
-    if len(plans) != n_scenes:
-        raise InputError(f"plans: there must be one for each of {n_scenes} scenes; got {len(plans)}")
-    kinds: dict[str, tuple[Plan, list[int]]] = {}
-    for cloud, scene in enumerate(particles.clouds.scenes):
-        kinds.setdefault(plans[scene].spec.hash, (plans[scene], []))[1].append(cloud)
-    yield from kinds.values()

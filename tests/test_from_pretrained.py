@@ -109,6 +109,17 @@ def test_checkpoints_that_are_refused(folder):
             Simulator.from_pretrained(folder, device="cuda")
     with pytest.raises(InputError, match="load it with Simulator.from_pretrained"):
         load_released(folder)
+    with pytest.raises(InputError, match="device: must be cpu or cuda; got 'tpu'"):
+        Simulator.from_pretrained(folder, device="tpu")
+
+
+def test_saving_replaces_checkpoints_alone(simulator, folder, tmp_path):
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "a.txt").write_text("kept")
+    with pytest.raises(InputError, match="notes: exists and is no checkpoint"):
+        simulator.save_pretrained(tmp_path / "notes")
+    assert (tmp_path / "notes" / "a.txt").read_text() == "kept"
+    assert simulator.save_pretrained(folder) == folder
 
 
 def test_released_weights_are_loaded_by_compat(tmp_path):

@@ -29,8 +29,10 @@ RINGS = {
         compat.checkpoints io
         effects.edits
         presets
-        effects.plan numerics.speed pretrained.loading
+        effects.plan
         cuda_graphs
+        numerics.speed
+        pretrained.loading
         simulator
     """,
     "workshop": """

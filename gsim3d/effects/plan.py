@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.effects.spec import EffectsSpec, UnsupportedEffect
+from gsim3d.errors import InputError
 from gsim3d.nn.point_transformer import BLOCK_KERNEL, STEM_KERNEL
 from gsim3d.presets import ModelConfig
+from gsim3d.state import Particles
 
 # Of a surface in a grid, a convolution of K^3 taps finds about K^2 neighbours; a coarser grid keeps 1 / stride^2 rows.
 SURFACE = 2
@@ -195,3 +197,21 @@ def _block(config: DynamicsConfig, particles: float, context: float, channels: i
     """A particle attends to its own patch, and to one of frozen particles."""
     dense = (BLOCK_KERNEL**SURFACE + 1 + 4 + 2 * config.mlp_ratio) * channels**2
     return particles * (dense + 2 * (min(particles, patch) + min(context, patch)) * channels)
+
+
+def by_plan(particles: Particles, plans: Sequence[Plan]) -> Iterator[tuple[Plan, list[int]]]:
+    """Each different plan, and the clouds of the scenes that it is for.
+
+    Args:
+        particles: of some scenes.
+        plans: one for each scene.
+    Raises:
+        InputError: there are more plans than scenes, or fewer.
+    """
+    n_scenes = particles.origin.shape[0]
+    if len(plans) != n_scenes:
+        raise InputError(f"plans: there must be one for each of {n_scenes} scenes; got {len(plans)}")
+    kinds: dict[str, tuple[Plan, list[int]]] = {}
+    for cloud, scene in enumerate(particles.clouds.scenes):
+        kinds.setdefault(plans[scene].spec.hash, (plans[scene], []))[1].append(cloud)
+    yield from kinds.values()

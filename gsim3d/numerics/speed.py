@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from gsim3d.cameras import InputSpec
+from gsim3d.cameras import Cameras, Frames, FrameSource, InputSpec
+from gsim3d.cuda_graphs import CapturedRollout, Prediction
+from gsim3d.effects.edits import Edit
 from gsim3d.effects.spec import EffectsSpec, Sleep
 from gsim3d.errors import InputError, check_ranges, did_you_mean
 from gsim3d.io.files import MAX_TEXT, read_file, shown
@@ -155,6 +157,42 @@ class Setting:
         kept = torch.zeros_like(group, dtype=torch.bool)
         kept[order] = rank < (counts[group[order]] * self.kept).ceil()
         return particles.select_rows(kept)
+
+
+def predict(
+    simulator: Any,
+    source: Frames | FrameSource,
+    steps: int,
+    cameras: Cameras | None,
+    background: torch.Tensor | None,
+    edits: Sequence[Edit],
+) -> Prediction:
+    """:meth:`gsim3d.Simulator.predict`, as the setting of the simulator says."""
+    if steps < 1:
+        raise InputError(f"predict: steps must be at least 1; got {steps}")
+    inputs = InputSpec() if simulator.inputs is None else simulator.inputs
+    frames = source if isinstance(source, Frames) else source.input_frames(inputs)
+    size = (frames.cameras.width, frames.cameras.height)
+    if inputs.image_size and size != tuple(inputs.image_size):
+        wanted = "x".join(map(str, inputs.image_size))
+        raise InputError(f"predict: images must be of {wanted} pixels, as in training; got {size[0]}x{size[1]}")
+    setting, plan, device = simulator.setting, simulator.plan(), next(simulator.parameters()).device
+    frames = frames.subsample(inputs.background_stride, inputs.body_stride).to(device)
+    with setting.precision("encoder", device.type):
+        state = setting.retained(simulator.encode(frames))
+    with setting.precision("dynamics", device.type):
+        if setting.captured and not edits and device.type == "cuda":
+            states = CapturedRollout(simulator, state, steps, plan)(state).steps
+        else:
+            states = simulator.rollout(state, steps, plan, edits=edits)
+    if cameras is None:
+        return Prediction(states, [])
+    drawn, cameras = states, cameras.to(device)
+    if setting.least_opacity:
+        drawn = [step.select_rows(step.opacities >= setting.least_opacity) for step in states]
+    with setting.precision("renderer", device.type):
+        images = [simulator._draw(step, cameras, background, plan, cutoff=setting.cutoff) for step in drawn]
+    return Prediction(states, images)
 
 
 def read_speeds(folder: Path) -> dict[str, Any]:

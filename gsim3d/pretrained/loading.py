@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
@@ -15,12 +16,15 @@ from torch.nn.modules.module import (
 )
 from torch.overrides import TorchFunctionMode
 
+from gsim3d import pretrained
 from gsim3d.cameras import InputSpec
 from gsim3d.compat.checkpoints import current_model, current_weights
 from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError
+from gsim3d.io import checkpoint
 from gsim3d.io.files import shown
 from gsim3d.io.settings import from_dict, to_dict
+from gsim3d.numerics.speed import load_speed
 from gsim3d.ops import cuda_compiled
 from gsim3d.presets import ModelConfig
 
@@ -46,6 +50,40 @@ class Description:
         data = {} if self.inputs is None else {k: v for k, v in to_dict(self.inputs).items() if v is not None}
         effects = {"spec": self.effects.to_dict(), "hash": self.effects.hash}
         return {"model": to_dict(self.model), "data": data, "effects": effects}
+
+
+def load(cls: type[Model], name_or_path: str | Path, device: str, speed: str) -> Model:
+    """:meth:`gsim3d.Simulator.from_pretrained` of the simulator class ``cls``."""
+    check_device(device)
+    saved = checkpoint.load(name_or_path)
+    if is_released(saved.config) != (cls.config_class is not ModelConfig):
+        wanted = "gsim3d.compat.load_released" if cls.config_class is ModelConfig else "Simulator.from_pretrained"
+        raise InputError(f"{name_or_path}: a checkpoint of another kind of model; load it with {wanted}")
+    try:
+        found = describe(saved.config, cls.config_class, pretrained.frame_rate(name_or_path))
+        folder = pretrained.located(name_or_path)
+        folder = folder if folder.is_dir() else folder.parent
+        setting = load_speed(folder, saved.digest, torch.device(device).type, speed)
+        simulator = with_weights(cls, setting.of_model(found.model), found.effects, saved.weights)
+    except InputError as error:
+        raise InputError(f"{name_or_path}: {error}") from None
+    except Exception as error:  # a configuration that describes no model raises anything
+        said = " ".join(str(error).split())[:200]
+        kind = type(error).__name__
+        raise InputError(f"{name_or_path}: its configuration describes no model: {kind}: {said}") from None
+    asymmetric = simulator.config.dynamics.is_asymmetric
+    simulator.effects, simulator.setting = setting.of_effects(found.effects, asymmetric), setting
+    simulator.inputs = setting.of_inputs(found.inputs)
+    return simulator.eval().to(device)
+
+
+def save(simulator: nn.Module, folder: Path) -> Path:
+    """:meth:`gsim3d.Simulator.save_pretrained` of ``simulator`` to ``folder``."""
+    if folder.exists() and not (folder / checkpoint.STATE).is_file():
+        raise InputError(f"{folder}: exists and is no checkpoint; name a new folder")
+    config = Description(simulator.config, simulator.effects, simulator.inputs).to_dict()
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    return checkpoint.write(folder, checkpoint.Checkpoint(simulator.state_dict(), config, {"step": 0}))
 
 
 def is_released(config: dict[str, Any]) -> bool:
@@ -158,7 +196,13 @@ def check_sizes(
 
 
 def check_device(device: str) -> None:
-    """Raises InputError where nothing can be computed on ``device``, such as "cpu" or "cuda"."""
-    if device.startswith("cuda") and not (cuda_compiled() and torch.cuda.is_available()):
+    """Raises InputError unless torch can compute on ``device``, such as "cpu" or "cuda"."""
+    try:
+        kind = torch.device(device).type
+    except (RuntimeError, TypeError):
+        kind = None
+    if kind not in ("cpu", "cuda"):
+        raise InputError(f"device: must be cpu or cuda; got {shown(device)}")
+    if kind == "cuda" and not (cuda_compiled() and torch.cuda.is_available()):
         reason = "torch finds no GPU" if cuda_compiled() else "gsim3d was built without CUDA"
         raise InputError(f"device {device}: {reason} (see gsim3d doctor)")
