@@ -33,8 +33,7 @@ def run(args: argparse.Namespace) -> int:
     from gsim3d import presets
     from gsim3d.data import Scene
     from gsim3d.effects.spec import EffectsSpec
-    from gsim3d.evaluate.plan_report import plan_report, workload
-    from gsim3d.profile.autotune import load_times
+    from gsim3d.evaluate.plan_report import load_times, plan_report, workload
     from gsim3d.train.config import DataConfig
     from gsim3d.train.restore import build_simulator, restore
 

@@ -3,14 +3,66 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
 
 from gsim3d.data import Scene, make_frames
 from gsim3d.effects.plan import Plan, Workload, background_cost, predicted_cost
 from gsim3d.effects.spec import EffectsSpec, OutputEffects
+from gsim3d.errors import InputError
+from gsim3d.io.settings import from_dict
 from gsim3d.io.terminal import in_columns
+from gsim3d.numerics.speed import SPEEDS_FILE, read_speeds
+from gsim3d.presets import ModelConfig
 from gsim3d.simulator import Simulator
 from gsim3d.train.config import DataConfig
+from gsim3d.train.restore import Restored
 from gsim3d.train.samples import context_cameras, spread_views, subsampled
+
+TIMES = "measured"  # the key of times in a file of speeds, beside the presets of a device
+
+
+@dataclass(frozen=True)
+class PartTimes:
+    """What the parts of a reference's step took: all that the checkpoint's spec asks for, launched kernel by kernel.
+
+    Attributes:
+        on: the machine.
+        work: a step of the scenes that it was measured on, and its images.
+        dynamics, gaussians, images: milliseconds of the parts of :func:`gsim3d.effects.plan.predicted_cost`.
+        host: milliseconds in which a GPU waits for the host.
+    """
+
+    on: str
+    work: Workload
+    dynamics: float = 0.0
+    gaussians: float = 0.0
+    images: float = 0.0
+    host: float = 0.0
+
+    def __post_init__(self):
+        if not all(type(count) is int and count >= 0 for count in asdict(self.work).values()):
+            raise InputError(f"work must hold counts; got {asdict(self.work)}")
+
+    def predicted(self, own: Plan, plan: Plan, model: ModelConfig, work: Workload) -> dict[str, float]:
+        """Milliseconds of each part under ``plan``: as many times those measured as the multiply-adds are more.
+
+        Args:
+            own: the plan of the checkpoint, under which the times were measured.
+            plan: to predict.
+            model: of both.
+            work: what ``plan`` is applied to.
+        """
+        before, after = predicted_cost(own, model, self.work), predicted_cost(plan, model, work)
+        scaled = {part: getattr(self, part) * after[part] / max(before[part], 1.0) for part in after}
+        return {**scaled, "host": self.host} if self.host else scaled
+
+
+def load_times(folder: Path, restored: Restored) -> dict[str, PartTimes]:
+    """Kind of device -> what the reference of a checkpoint took where it was measured; empty where it was not."""
+    devices, where = read_speeds(folder).get(restored.checkpoint.digest) or {}, folder / SPEEDS_FILE
+    known = {name: kept[TIMES] for name, kept in devices.items() if isinstance(kept, dict) and TIMES in kept}
+    return {name: from_dict(PartTimes, values, f"{where}: {name}: {TIMES}: ") for name, values in known.items()}
 
 
 def workload(scene: Scene, data: DataConfig) -> Workload:
@@ -26,7 +78,9 @@ def workload(scene: Scene, data: DataConfig) -> Workload:
     return Workload(moving, kept - moving, 1, scene.height * scene.width)
 
 
-def plan_report(simulator: Simulator, plan: Plan, work: Workload, times: dict, own: Plan) -> Iterator[str]:
+def plan_report(
+    simulator: Simulator, plan: Plan, work: Workload, times: dict[str, PartTimes], own: Plan
+) -> Iterator[str]:
     """Paragraphs: priors, switches and outputs that are on, unused parameters, and the predicted costs of a step.
 
     Args:

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from gsim3d.effects.plan import Plan, Workload, predicted_cost
+from gsim3d.effects.plan import Workload
 from gsim3d.errors import InputError
+from gsim3d.evaluate.plan_report import TIMES, PartTimes
 from gsim3d.evaluate.report import write_json
-from gsim3d.io.settings import from_dict
 from gsim3d.numerics.speed import SPEEDS_FILE, Setting, read_speeds
-from gsim3d.presets import ModelConfig
 from gsim3d.profile.settings import GROUPS, Group
 from gsim3d.profile.sweep import MOST_KEPT, PRESETS, BenchmarkCase, Effort, Point, Sweep, tie
 from gsim3d.profile.timing import GAPS, machine
@@ -23,7 +22,6 @@ from gsim3d.train.restore import Restored
 
 # preset -> share of the reference's gain over particles held still, in dB, that it keeps at least
 PROMISES = {"exact": None, "balanced": 0.999, "fast": 0.99}
-TIMES = "measured"  # the key of times, beside the presets of a device
 PART_OF_SECTION = {"head": "gaussians", "sort and raster": "images", GAPS: "host"}  # all others: the dynamics
 
 
@@ -126,61 +124,20 @@ def _faster(point: Point, than: Point) -> bool:
 # ---- what is kept beside the weights ----
 
 
-@dataclass(frozen=True)
-class PartTimes:
-    """What the parts of a reference's step took: all that the checkpoint's spec asks for, launched kernel by kernel.
-
-    Attributes:
-        on: the machine.
-        work: a step of the scenes that it was measured on, and its images.
-        dynamics, gaussians, images: milliseconds of the parts of :func:`gsim3d.effects.plan.predicted_cost`.
-        host: milliseconds in which a GPU waits for the host.
-    """
-
-    on: str
-    work: Workload
-    dynamics: float = 0.0
-    gaussians: float = 0.0
-    images: float = 0.0
-    host: float = 0.0
-
-    def __post_init__(self):
-        if not all(type(count) is int and count >= 0 for count in asdict(self.work).values()):
-            raise InputError(f"work must hold counts; got {asdict(self.work)}")
-
-    @classmethod
-    def of(cls, case: BenchmarkCase, reference: Point) -> PartTimes | None:
-        """Of a reference that was timed on ``case``; None where its sections were not watched."""
-        if not reference.sections():
-            return None
-        parts: dict[str, float] = {}
-        for section, seconds in reference.sections().items():
-            part = PART_OF_SECTION.get(section, "dynamics")
-            parts[part] = parts.get(part, 0.0) + 1e3 * seconds
-        moving, counts = [], []
-        for number in range(len(case.scenes))[:MOST_KEPT]:
-            activity = case.newest(number).activity
-            moving.append(int((activity == DYNAMIC).sum()))
-            counts.append(len(activity))
-        height, width = case.restored.image_size
-        work = Workload(
-            round(fmean(moving)), round(fmean(counts)) - round(fmean(moving)), len(case.views[0][1]), height * width
-        )
-        facts = machine(case.device)
-        return cls(", ".join(facts[name] for name in ("processor", "device") if name in facts), work, **parts)
-
-    def predicted(self, own: Plan, plan: Plan, model: ModelConfig, work: Workload) -> dict[str, float]:
-        """Milliseconds of each part under ``plan``: as many times those measured as the multiply-adds are more.
-
-        Args:
-            own: the plan of the checkpoint, under which the times were measured.
-            plan: to predict.
-            model: of both.
-            work: what ``plan`` is applied to.
-        """
-        before, after = predicted_cost(own, model, self.work), predicted_cost(plan, model, work)
-        scaled = {part: getattr(self, part) * after[part] / max(before[part], 1.0) for part in after}
-        return {**scaled, "host": self.host} if self.host else scaled
+def part_times(case: BenchmarkCase, reference: Point) -> PartTimes | None:
+    """What the parts of a step of ``reference`` took on ``case``; None where its sections were not watched."""
+    if not reference.sections():
+        return None
+    parts: dict[str, float] = {}
+    for section, seconds in reference.sections().items():
+        part = PART_OF_SECTION.get(section, "dynamics")
+        parts[part] = parts.get(part, 0.0) + 1e3 * seconds
+    newest = [case.newest(number).activity for number in range(len(case.scenes))[:MOST_KEPT]]
+    moving = round(fmean(int((activity == DYNAMIC).sum()) for activity in newest))
+    height, width = case.restored.image_size
+    work = Workload(moving, round(fmean(map(len, newest))) - moving, len(case.views[0][1]), height * width)
+    facts = machine(case.device)
+    return PartTimes(", ".join(facts[name] for name in ("processor", "device") if name in facts), work, **parts)
 
 
 def save_speeds(folder: Path, restored: Restored, presets: dict[str, Point], times: PartTimes | None = None) -> Path:
@@ -192,10 +149,3 @@ def save_speeds(folder: Path, restored: Restored, presets: dict[str, Point], tim
         settings[TIMES] = asdict(times)
     write_json(path, {**known, digest: {**known.get(digest, {}), device: settings}})
     return path
-
-
-def load_times(folder: Path, restored: Restored) -> dict[str, PartTimes]:
-    """Kind of device -> what the reference of a checkpoint took where it was measured; empty where it was not."""
-    devices, where = read_speeds(folder).get(restored.checkpoint.digest) or {}, folder / SPEEDS_FILE
-    known = {name: kept[TIMES] for name, kept in devices.items() if isinstance(kept, dict) and TIMES in kept}
-    return {name: from_dict(PartTimes, values, f"{where}: {name}: {TIMES}: ") for name, values in known.items()}

@@ -26,7 +26,7 @@ from gsim3d.io.locks import only_one_writer
 from gsim3d.io.terminal import in_columns
 from gsim3d.numerics.speed import SPEEDS_FILE
 from gsim3d.pretrained import located
-from gsim3d.profile.autotune import PartTimes, save_speeds, tune
+from gsim3d.profile.autotune import part_times, save_speeds, tune
 from gsim3d.profile.settings import GROUPS, KINDS, Group
 from gsim3d.profile.sweep import (
     FULL,
@@ -128,7 +128,7 @@ def profile(
             "not_measured": {**case.not_measured, **not_measured},
         }
         files = write(out, case, points, presets, content)
-        files.append(_keep_speeds(located(checkpoint), out, restored, presets, PartTimes.of(case, points[0])))
+        files.append(_keep_speeds(located(checkpoint), out, restored, presets, part_times(case, points[0])))
     return content, files
 
 
@@ -386,8 +386,9 @@ def cost_figure(points: Sequence[Point], case: BenchmarkCase, presets: dict[str,
     axes.set_ylim(LEAST_LOSS / 1.8, 12 * MOST_LOSS)  # space for what is said of the presets
     ticks = {LEAST_LOSS: "none", 1e-3: "0.1 %", 1e-2: "1 %", 0.1: "10 %", 1.0: "100 %", MOST_LOSS: "more"}
     axes.set_yticks(list(ticks), list(ticks.values()))
-    axes.minorticks_off()
-    _plain_times(axes)
+    axes.yaxis.set_minor_locator(pyplot().NullLocator())
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter("{x:g}")
     for share, text in PROMISED.items():
         axes.axhline(1 - share, color="#444444", linewidth=1, linestyle="--", zorder=1)
         axes.text(1.005, 1 - share, text, transform=axes.get_yaxis_transform(), va="center", fontsize=9)
@@ -435,15 +436,6 @@ def _mark_presets(axes, presets: dict[str, Point], reference: Point, lost: Calla
         box = {"boxstyle": "round", "facecolor": "#fff8e8", "edgecolor": "#e0a030"}
         at = {"xytext": (0.015 + 0.345 * place, 0.98), "textcoords": "axes fraction", "va": "top"}
         axes.annotate(text, (x, y), **at, fontsize=8.5, bbox=box, arrowprops={"arrowstyle": "-", "color": "#e0a030"})
-
-
-def _plain_times(axes) -> None:
-    """Milliseconds as plain numbers."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def sections_figure(points: Sequence[Point]) -> bytes:

@@ -9,10 +9,9 @@ import pytest
 from gsim3d import presets
 from gsim3d.effects.spec import AppearanceEffects, DynamicsEffects, EffectsSpec
 from gsim3d.evaluate.infer_effects import propose, smaller_settings
-from gsim3d.evaluate.plan_report import workload
+from gsim3d.evaluate.plan_report import PartTimes, workload
 from gsim3d.io import read_ply
 from gsim3d.profile import autotune
-from gsim3d.profile.autotune import PartTimes
 from gsim3d.train.restore import build_simulator, restore
 from tests.cli.test_commands import call, work  # noqa: F401
 from tests.effects.test_spec import saved

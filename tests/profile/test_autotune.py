@@ -9,10 +9,10 @@ import gsim3d
 from gsim3d.effects.plan import Workload, predicted_cost
 from gsim3d.effects.spec import DynamicsEffects, EffectsSpec
 from gsim3d.errors import InputError
+from gsim3d.evaluate.plan_report import TIMES, PartTimes, load_times
 from gsim3d.io.checkpoint import Checkpoint
 from gsim3d.numerics.speed import SPEEDS_FILE, Setting, load_speed
 from gsim3d.profile import autotune
-from gsim3d.profile.autotune import PartTimes
 from gsim3d.profile.settings import GROUPS
 from gsim3d.profile.sweep import Agreement, Effort, Point, Sweep, TimeLimit
 from gsim3d.profile.timing import Timing
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 SHORT = Effort(n_rounds=2, repeats=2, warm_up=0)
 SECTIONS = {"serialise": 0.002, "attention": 0.003, "state and guards": 0.001, "head": 0.004, "sort and raster": 0.005}
 REFERENCE = Point(Setting(), "", "exact", step=(Timing((0.015,), SECTIONS),))
-TIMES = PartTimes("here", Workload(100, 300, 2, 1024), dynamics=6.0, gaussians=4.0, images=5.0, host=2.0)
+MEASURED = PartTimes("here", Workload(100, 300, 2, 1024), dynamics=6.0, gaussians=4.0, images=5.0, host=2.0)
 
 
 def at(setting, seconds, psnr, other_round=None):
@@ -160,39 +160,42 @@ def test_tuned_presets_are_found_again(tmp_path, restored):
 
 
 def test_sections_are_summed_to_parts(case):
-    times = PartTimes.of(case, REFERENCE)
+    times = autotune.part_times(case, REFERENCE)
     assert (times.dynamics, times.gaussians, times.images, times.host) == pytest.approx((6.0, 4.0, 5.0, 0.0))
     newest = [case.newest(number).activity for number in range(2)]
     moving, count = (sum(counts) / 2 for counts in zip(*((int((a == 0).sum()), len(a)) for a in newest)))
     assert times.work == Workload(round(moving), round(count) - round(moving), len(case.views[0][1]), 32 * 32)
     waits = Point(Setting(), "", "exact", step=(Timing((0.015,), {**SECTIONS, "host gaps": 0.01}),))
-    assert PartTimes.of(case, waits).host == pytest.approx(10.0)
-    assert PartTimes.of(case, Point(Setting(), "", "exact", step=(Timing((0.015,), {}),))) is None
+    assert autotune.part_times(case, waits).host == pytest.approx(10.0)
+    assert autotune.part_times(case, Point(Setting(), "", "exact", step=(Timing((0.015,), {}),))) is None
 
 
 def test_milliseconds_grow_as_multiply_adds(case):
     simulator = case.restored.simulator
     own, masked = simulator.plan(), simulator.plan(EffectsSpec(DynamicsEffects("masked_out")))
-    same = TIMES.predicted(own, own, simulator.config, TIMES.work)
+    same = MEASURED.predicted(own, own, simulator.config, MEASURED.work)
     assert same == pytest.approx({"dynamics": 6.0, "gaussians": 4.0, "images": 5.0, "host": 2.0})
-    work = dataclasses.replace(TIMES.work, views=1)
-    before = predicted_cost(own, simulator.config, TIMES.work)
-    after, found = predicted_cost(masked, simulator.config, work), TIMES.predicted(own, masked, simulator.config, work)
+    work = dataclasses.replace(MEASURED.work, views=1)
+    before = predicted_cost(own, simulator.config, MEASURED.work)
+    after, found = (
+        predicted_cost(masked, simulator.config, work),
+        MEASURED.predicted(own, masked, simulator.config, work),
+    )
     assert found["host"] == 2.0, "however little is computed"
     for part in ("dynamics", "gaussians", "images"):
-        measured = getattr(TIMES, part)
+        measured = getattr(MEASURED, part)
         assert 0 < found[part] < measured and found[part] == pytest.approx(measured * after[part] / before[part])
 
 
 def test_times_are_kept_beside_presets(tmp_path, restored):
-    assert autotune.load_times(tmp_path, restored) == {}
+    assert load_times(tmp_path, restored) == {}
     autotune.save_speeds(tmp_path, restored, {"exact": REFERENCE})
-    assert autotune.load_times(tmp_path, restored) == {}
-    autotune.save_speeds(tmp_path, restored, {"exact": REFERENCE}, TIMES)
-    assert autotune.load_times(tmp_path, restored) == {"cpu": TIMES}
+    assert load_times(tmp_path, restored) == {}
+    autotune.save_speeds(tmp_path, restored, {"exact": REFERENCE}, MEASURED)
+    assert load_times(tmp_path, restored) == {"cpu": MEASURED}
     assert speed_of(tmp_path, restored, "exact") == Setting()
     other = dataclasses.replace(restored, checkpoint=Checkpoint({}, {}, digest="2e"))
-    assert autotune.load_times(tmp_path, other) == {}
+    assert load_times(tmp_path, other) == {}
 
 
 @pytest.mark.parametrize(
@@ -205,13 +208,13 @@ def test_times_are_kept_beside_presets(tmp_path, restored):
     ],
 )
 def test_damaged_times_are_refused(tmp_path, restored, change, message):
-    values = dataclasses.asdict(TIMES) | change
-    (tmp_path / SPEEDS_FILE).write_text(json.dumps({"1f": {"cpu": {autotune.TIMES: values}}}))
+    values = dataclasses.asdict(MEASURED) | change
+    (tmp_path / SPEEDS_FILE).write_text(json.dumps({"1f": {"cpu": {TIMES: values}}}))
     with pytest.raises(InputError, match=message):
-        autotune.load_times(tmp_path, restored)
+        load_times(tmp_path, restored)
 
 
 def test_file_of_speeds_that_is_nested_without_end(tmp_path, restored):
     (tmp_path / SPEEDS_FILE).write_text("[" * 100_000)
     with pytest.raises(InputError, match="speeds.json cannot be read: it is nested too deeply"):
-        autotune.load_times(tmp_path, restored)
+        load_times(tmp_path, restored)

@@ -34,11 +34,11 @@ from gsim3d.effects.edits import load_edits
 from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError, NumericalError
 from gsim3d.evaluate.perceptual import weights
+from gsim3d.evaluate.plan_report import TIMES, load_times
 from gsim3d.evaluate.predictions import Predictions
 from gsim3d.io import checkpoint, read_ply, read_splats, write_ply, write_splats
 from gsim3d.io.settings import from_dict, load_yaml, to_dict
 from gsim3d.numerics.speed import load_speed
-from gsim3d.profile.autotune import TIMES, load_times
 from gsim3d.simulator import Simulator
 from gsim3d.state import Gaussians
 from gsim3d.synth.meshes import load_body
@@ -282,7 +282,7 @@ def _read_meshes(folder: Path, what: str) -> None:
 
 def _write_speeds(folder: Path) -> None:
     times = {"on": "a machine", "work": {"moving": 100, "frozen": 50}, "dynamics": 1.5, "images": 2.5}
-    content = {"digest": {"cpu": {"fast": {"sleep": 0.1, "sh_degree": 0, "every": 2}, TIMES: times}}}
+    content = {"digest": {"cpu": {"fast": {"sleep": 0.1, "sh_degree": 0, "history": 2}, TIMES: times}}}
     (folder / "speeds.json").write_text(json.dumps(content))
 
 
