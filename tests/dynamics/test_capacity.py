@@ -49,7 +49,7 @@ def test_a_pyramid_made_before_changes_no_bit():
 
 
 @pytest.mark.parametrize("norm", ["layer", "batch"])
-def test_gradients_do_not_see_the_room(norm):
+def test_gradients_are_independent_of_capacity(norm):
     config = dataclasses.replace(TINY, norm=norm)
     dynamics, history = make_dynamics(config, dtype=torch.float64), make_history((40, 30), dtype=torch.float64)
     history = some_asleep(history)
@@ -64,7 +64,7 @@ def test_gradients_do_not_see_the_room(norm):
         assert_close_relative_to_max(given, exact, 1e-12)
 
 
-def test_padding_rows_are_finite_and_unseen():
+def test_padding_is_finite_and_changes_no_particle():
     dynamics, history = make_dynamics(), make_history((40, 30))
     pyramid, exact = with_room(dynamics, history, 4.0), dynamics.geometry(history)
     packed = dynamics.layout.pack(history)
@@ -80,7 +80,7 @@ def test_padding_rows_are_finite_and_unseen():
         assert x.shape[0] == stage.n_rows and torch.isfinite(x).all()
 
 
-def test_what_does_not_fit_changes_nothing():
+def test_overflow_is_counted():
     dynamics, history = make_dynamics(), make_history((40, 30))
     capacity = PyramidCapacity.of(dynamics.geometry(history), history.n_rows, 1.0)
     sizes = (capacity.sizes[0], *(size // 2 for size in capacity.sizes[1:]))
@@ -91,7 +91,7 @@ def test_what_does_not_fit_changes_nothing():
     assert_same_bits(step.dynamic_latents, history.dynamic_latents[40:])
 
 
-def test_invisible_rows_need_no_capacity():
+def test_unseen_particles_need_no_capacity():
     dynamics, history = make_dynamics(RELIT), some_asleep(make_history((400, 300, 200), frozen_share=0.8))
     assert dynamics.room(history) < 0.6 * history.n_rows
     assert make_dynamics(MOVING).room(history) == history.n_rows
@@ -102,7 +102,7 @@ def test_invisible_rows_need_no_capacity():
         assert_same_bits(getattr(step, name), value, name)
 
 
-def test_more_seen_rows_than_there_is_room_for_are_noticed():
+def test_too_many_seen_particles_are_counted():
     dynamics, history = make_dynamics(RELIT), make_history((40, 30), frozen_share=0.8)
     exact = dynamics.geometry(history)
     n_seen = exact.stages[0].n_rows
@@ -115,7 +115,7 @@ def test_more_seen_rows_than_there_is_room_for_are_noticed():
     assert_same_bits(dynamics(history, pyramid=pyramid).means, dynamics(history).means)
 
 
-def test_batch_norm_refuses_to_count_rows_that_are_none():
+def test_batch_norm_refuses_padding():
     dynamics, history = make_dynamics(dataclasses.replace(TINY, norm="batch")), make_history((40, 30))
     pyramid = with_room(dynamics, history)
     dynamics(history, pyramid=pyramid)

@@ -104,7 +104,7 @@ def test_whole_cells_of_translation_change_nothing_but_positions():
 
 
 @pytest.mark.parametrize("position_features", [False, True])
-def test_position_features_decide_whether_the_place_matters(position_features):
+def test_motion_depends_on_position_with_position_features_only(position_features):
     config = dataclasses.replace(TINY, position_features=position_features)
     dynamics, history = make_dynamics(config), make_history((30, 30))
     cells = 64.0 * TINY.grid_size  # a multiple of the coarsest cell and of the curves' coarse levels

@@ -1,4 +1,4 @@
-"""A relightable background: read as it was when the simulation began, without accumulating errors."""
+"""A relightable background: seen as it was when the simulation began, so that errors do not add up."""
 
 import dataclasses
 

@@ -43,7 +43,7 @@ def scene_of_rows(particles):
 @pytest.mark.parametrize("kernel_size", [3, 5])
 def test_convolution_tap_adds_moving_and_frozen_means(kernel_size):
     parts, rest, moving, background, recorder = read_and_reader()
-    conv = SparseConv(3, 4, kernel_size, bias=True, duplicates="mean").double()
+    conv = SparseConv(3, 4, kernel_size, bias=True).double()
     x_rest, x = torch.randn(rest.stages[0].n_rows, 3).double(), torch.randn(moving.stages[0].n_rows, 3).double()
     recorder.convolved(conv, x_rest, x_rest)
     out = conv(x, moving.stages[0], background.readers(moving, parts.moving)[0])

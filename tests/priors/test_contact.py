@@ -64,7 +64,7 @@ def weights(history, moving):
 
 
 @pytest.mark.parametrize("what", ["motions", "back"])
-def test_what_rows_do_to_each_other_neither_moves_nor_turns_their_body(what):
+def test_internal_displacements_conserve_momentum_and_spin(what):
     history = ball(1.0)
     moving, places = moving_places(history)
     found, share = moves(history, **{what: noise(history) + 0.02})[moving], weights(history, moving)
@@ -73,7 +73,7 @@ def test_what_rows_do_to_each_other_neither_moves_nor_turns_their_body(what):
     assert (share * torch.linalg.cross(places - (share * places).sum(0), found)).sum(0).abs().max() < 1e-5
 
 
-def test_what_is_kept_near_the_ground_moves_and_turns_the_body_by_where_it_is():
+def test_gained_displacements_near_ground_move_and_turn_body():
     history, push = ball(0.0), torch.tensor([0.02, 0.0, 0.01])
     moving, places = moving_places(history)
     found = torch.stack([moves(history, motions=x)[moving] for x in (0.0, push)]).diff(dim=0)[0]
@@ -86,7 +86,7 @@ def test_what_is_kept_near_the_ground_moves_and_turns_the_body_by_where_it_is():
     assert_close_relative_to_max(spin, (share * torch.linalg.cross(places, expected)).sum(0), 0.05)
 
 
-def test_what_is_kept_of_a_row_is_counted_once():
+def test_gained_displacement_counts_once():
     history = ball(0.0)
     moving, _ = moving_places(history)
     lowest, push = history.means[moving, 2].argmin(), torch.tensor([0.0, 0.0, 0.02])
@@ -106,7 +106,7 @@ def two_balls():
     return dataclasses.replace(both, body=bodies(both)), first & (both.activity == DYNAMIC)
 
 
-def test_bodies_push_themselves_alone_however_near_others_are():
+def test_contact_of_one_body_leaves_neighboring_body():
     """What a window about as large as a body would not do: what stops one slows the other, too."""
     history, first = two_balls()
     second = (history.activity == DYNAMIC) & ~first
@@ -118,7 +118,7 @@ def test_bodies_push_themselves_alone_however_near_others_are():
 
 
 @pytest.mark.parametrize("which", [0, 1])
-def test_in_windows_of_bodies_no_momentum_is_lost_nor_made(which):
+def test_segmented_windows_conserve_momentum(which):
     history, first = two_balls()
     chosen = first if which == 0 else (history.activity == DYNAMIC) & ~first
     found = windows(history, 0.3, CELL, evenly=True)
@@ -130,7 +130,7 @@ def test_in_windows_of_bodies_no_momentum_is_lost_nor_made(which):
     assert (share * torch.linalg.cross(places - (share * places).sum(0), found)).sum(0).abs().max() < 1e-5
 
 
-def test_a_solid_body_stops_as_a_whole():
+def test_rigid_contact_stops_whole_body():
     """Of a ball that falls by 8 cm and comes from 2 cm above most rows fall on, if it is not solid."""
     history = ball(0.02)
     history = dataclasses.replace(history, body=bodies(history))
@@ -144,7 +144,7 @@ def test_a_solid_body_stops_as_a_whole():
 
 
 @pytest.mark.parametrize("solid", [False, True])
-def test_faint_rows_stop_no_solid_body(solid):
+def test_faint_particles_stop_no_rigid_body(solid):
     """Of a ball high above the ground one row is below it."""
     history = ball(0.2)
     moving = history.activity == DYNAMIC
@@ -162,7 +162,7 @@ def test_faint_rows_stop_no_solid_body(solid):
     assert (stopped[1].abs().max() < 1e-6) if solid else torch.equal(*found)
 
 
-def test_a_solid_body_that_is_stopped_at_one_end_turns():
+def test_rigid_contact_at_one_end_turns_body():
     history = ball(0.02)
     moving = history.activity == DYNAMIC
     slope = torch.tensor([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]])
@@ -178,7 +178,7 @@ def test_a_solid_body_that_is_stopped_at_one_end_turns():
 
 
 @pytest.mark.parametrize("skin", [0.0, 0.02])
-def test_rows_stop_at_the_ground_and_stick_to_it(skin):
+def test_contact_stops_particles_at_offset(skin):
     """A ball that falls by 8 cm and comes from 2 cm above."""
     history = ball(0.02)
     moving, _ = moving_places(history)
@@ -192,7 +192,7 @@ def test_rows_stop_at_the_ground_and_stick_to_it(skin):
     assert_close_relative_to_max(found[~stopped], torch.tensor([0.03, 0.0, -0.08]).expand_as(found[~stopped]), 1e-4)
 
 
-def test_friction_takes_as_much_of_what_slides_as_it_may():
+def test_friction_limits_tangential_loss():
     history = ball(0.0)
     moving, _ = moving_places(history)
     lowest = history.means[moving, 2].argmin()
@@ -203,7 +203,7 @@ def test_friction_takes_as_much_of_what_slides_as_it_may():
         assert found[0].item() == pytest.approx(left, abs=2e-3) and found[2].item() == pytest.approx(-height, abs=2e-3)
 
 
-def test_what_got_behind_the_ground_may_stay_and_come_back():
+def test_particles_below_ground_may_stay_or_rise():
     history = ball(-0.03)
     moving, _ = moving_places(history)
     lowest = history.means[moving, 2].argmin()
@@ -211,7 +211,7 @@ def test_what_got_behind_the_ground_may_stay_and_come_back():
     assert down.abs() < 1e-3 and up.item() == pytest.approx(0.02, abs=1e-4)
 
 
-def test_untrained_a_ball_falls_is_squeezed_and_jumps():
+def test_untrained_ball_bounces():
     dynamics = make_dynamics(PUSHED)
     torch.nn.init.zeros_(dynamics.net.head.fc2.weight), torch.nn.init.zeros_(dynamics.net.head.fc2.bias)
     history = ball(0.1, (0.01, 0.0, -0.04))
@@ -228,7 +228,7 @@ def test_untrained_a_ball_falls_is_squeezed_and_jumps():
     assert_close_relative_to_max(centre[1] - centre[0], torch.tensor(-0.04 + FALL[2]), 0.02)
 
 
-def test_rows_that_cannot_move_keep_what_they_were_given_and_scenes_do_not_meet():
+def test_contact_of_batch_equals_single_scenes():
     one, other = ball(0.0), ball(0.0, n=200, seed=3)
     both = batch([one, other])
     motions = [noise(history, seed) for seed, history in enumerate((one, other))]
@@ -257,7 +257,7 @@ def test_gradients(solid):
     assert torch.autograd.gradcheck(found, inputs)
 
 
-def test_where_rows_stop_does_not_follow_where_they_were():
+def test_stopped_height_has_no_gradient_to_position():
     history = ball(0.02)
     means = history.means.clone().requires_grad_()
     history = dataclasses.replace(history, means=means)
@@ -269,7 +269,7 @@ def test_where_rows_stop_does_not_follow_where_they_were():
 
 
 @pytest.mark.parametrize("share", ["own motion", "way back"])
-def test_what_shares_do_to_a_jump_is_what_their_gradient_says(share):
+def test_gain_gradient_matches_finite_difference(share):
     """Of how high a ball is that was squeezed and jumps: a row that went back is nearer to its place from then on."""
     history = ball(0.1, (0.02, 0.0, -0.06), (0.03, 0.06, 0.0))
     dynamics = make_dynamics(PUSHED)
@@ -289,7 +289,7 @@ def test_what_shares_do_to_a_jump_is_what_their_gradient_says(share):
     assert grad.item() == pytest.approx(slope.item(), rel=0.35) and slope > 0.02
 
 
-def test_what_is_kept_of_motions_moves_a_higher_body_less_and_has_that_gradient():
+def test_proximity_gradient_matches_finite_difference():
     history, push = ball(0.02), torch.tensor([0.02, 0.0, 0.0])
     moving, _ = moving_places(history)
     share = weights(history, moving)
@@ -305,7 +305,7 @@ def test_what_is_kept_of_motions_moves_a_higher_body_less_and_has_that_gradient(
     assert grad.item() == pytest.approx(slope.item(), rel=0.1) and slope < -0.005
 
 
-def test_in_flight_nothing_pushes():
+def test_flight_is_unchanged_by_contact():
     history = ball(2.0, (0.03, 0.01, 0.02), (0.0, 0.05, 0.0))
     one, other = (make_dynamics(config) for config in (PUSHED, FLYING))
     for dynamics in (one, other):
@@ -315,7 +315,7 @@ def test_in_flight_nothing_pushes():
     assert_close_relative_to_max(ways[0][moving], ways[1][moving], 0.02)
 
 
-def test_weights_learn_from_what_the_ground_does():
+def test_contact_parameters_have_gradients():
     history = ball(0.0, (0.03, 0.0, -0.02))
     dynamics = make_dynamics(PUSHED)
     (step,) = rollout(dynamics, history, 1, max_steps=2)
@@ -331,8 +331,8 @@ def test_weights_learn_from_what_the_ground_does():
 
 def test_where_nothing_is_nothing_happens():
     history = ball(0.02)
-    none = history.select_rows(torch.zeros(history.n_rows, dtype=torch.bool))
-    assert make_dynamics(PUSHED)(none).means.shape == (0, 3)
+    empty = history.select_rows(torch.zeros(history.n_rows, dtype=torch.bool))
+    assert make_dynamics(PUSHED)(empty).means.shape == (0, 3)
     found = moves(ball(0.0, ground=False), onward=[0.0, 0.0, -0.05])
     assert_close_relative_to_max(found, torch.tensor([0.0, 0.0, -0.05]).expand_as(found), 1e-6)
 
@@ -346,7 +346,7 @@ def test_transparent_background_stops_no_particle():
         assert (found[:, 2] > -0.07).any() == stops
 
 
-def test_a_gpu_pushes_the_same(devices):
+def test_contact_on_gpu(devices):
     history = ball(0.01)
     expected, actual, again = (
         moves(history.to(d), onward=[0.01, 0.0, -0.03], motions=noise(history).to(d), radius=0.2).cpu()
@@ -356,7 +356,7 @@ def test_a_gpu_pushes_the_same(devices):
     assert_same_bits(again, actual)
 
 
-def test_compiled_it_is_the_same(device):
+def test_compiled(device):
     history = ball(0.0, n=60).to(device)
     motions = noise(history.to("cpu")).to(device)
     history.clouds
@@ -375,7 +375,7 @@ def test_contact_needs_other_priors(name):
         without_prior(config, name)
 
 
-def test_rows_count_as_much_as_the_surface_around_them():
+def test_even_windows_weigh_particles_by_surface():
     """Of the lower half of a ball one row in five is seen."""
     history = ball(1.0, n=800)
     moving, _ = moving_places(history)

@@ -56,7 +56,7 @@ def touch_of(history, priors=None):
 
 
 @pytest.mark.parametrize("ground", [True, False])
-def test_in_flight_bodies_follow_a_parabola_and_turn_whatever_is_predicted(ground):
+def test_flight_is_ballistic_for_any_prediction(ground):
     history = ball(2.0, (0.03, 0.01, 0.02), (0.0, 0.05, 0.0), ground=ground)
     moves = history.activity == DYNAMIC
     seen = []
@@ -88,7 +88,7 @@ def test_touching_bodies_do_not_fall_and_gains_count_in_full():
     assert (steps[0].means - steps[1].means)[moves].abs().amax(1).gt(1e-4).all()
 
 
-def test_how_far_a_body_touches_falls_with_its_height():
+def test_touch_decreases_with_height():
     heights = (0.0, 0.05, 0.1, 0.13, 0.2, 0.3, 1.0)
     touch = torch.stack([touch_of(ball(h))[-300:].mean() for h in heights])
     assert (touch.diff() <= 0).all() and touch[0] == 1 and 0.05 < touch[3] < 0.95
@@ -96,29 +96,29 @@ def test_how_far_a_body_touches_falls_with_its_height():
     assert not touch_of(ball(0.0, ground=False)).any()
 
 
-def test_where_products_are_rounded_it_is_the_same():
+def test_touch_under_autocast():
     history = ball(0.35)
     with torch.autocast("cpu", torch.bfloat16):
         rounded = touch_of(history)
     assert_same_bits(rounded, touch_of(history))
 
 
-def test_scenes_do_not_see_each_other():
+def test_batch_equals_single_scenes():
     one, other = ball(0.2), ball(0.0, seed=2, n=200, ground=False)
     both = touch_of(batch([one, other]))
     assert_close_relative_to_max(both, torch.cat([touch_of(q) for q in (one, other)]), 1e-4)
 
 
-def test_where_there_is_nothing_nothing_touches():
+def test_gravity_of_empty_or_invalid_scene():
     history = ball(0.02)
-    none = history.select_rows(torch.zeros(history.n_rows, dtype=torch.bool))
-    assert make_dynamics(FLYING)(none).means.shape == (0, 3)
+    empty = history.select_rows(torch.zeros(history.n_rows, dtype=torch.bool))
+    assert make_dynamics(FLYING)(empty).means.shape == (0, 3)
     means = history.means.clone()
     means[-1], means[3] = torch.nan, torch.inf
     assert touch_of(dataclasses.replace(history, means=means)).isfinite().all()
 
 
-def test_training_reaches_gravity_and_velocities():
+def test_gravity_and_velocity_have_gradients():
     dynamics, history = make_dynamics(FLYING), ball(0.3, (0.0, 0.0, -0.05), n=100)
     history = dataclasses.replace(history, velocity=history.velocity.requires_grad_())
     steps = rollout(dynamics, history, 3, max_steps=2)
@@ -129,7 +129,7 @@ def test_training_reaches_gravity_and_velocities():
     assert history.velocity.grad[history.activity == DYNAMIC].abs().amax(1).gt(0).all()
 
 
-def test_a_gpu_finds_the_same(devices):
+def test_on_gpu(devices):
     history = batch([ball(0.2, (0.01, 0.0, -0.05)), ball(0.1, seed=2, ground=False)])
     expected, actual, again = (touch_of(history.to(d)).cpu() for d in (*devices, devices[1]))
     assert_close_relative_to_max(actual, expected, 1e-4)

@@ -1,4 +1,4 @@
-"""Particles that carry their velocity, and the velocity field around them."""
+"""Particles that carry their velocity, and the momentum of those around them."""
 
 import dataclasses
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gsim3d.dynamics import last_steps, rollout, with_attribute
-from gsim3d.effects.edits import Rotate
+from gsim3d.effects.edits import Rotate, Throw
 from gsim3d.math.rotations import rotation_matrices
 from gsim3d.priors import InertiaConfig
 from gsim3d.priors.inertia import rotate_with_window
@@ -51,7 +51,7 @@ def flying(n_steps=2, **options):
     return dataclasses.replace(history, velocity=velocity.flatten(0, 1))
 
 
-def test_what_comes_next_follows_from_what_is_momentum():
+def test_velocities_continue_rigid_motion():
     history = flying()
     moved, rigid, own = velocities(history).unbind(1)
     n = history.clouds.count(1)
@@ -61,7 +61,7 @@ def test_what_comes_next_follows_from_what_is_momentum():
 
 
 @pytest.mark.parametrize("squashed", [1.0, 0.2])
-def test_a_whole_body_may_tumble(squashed):
+def test_tumbling_body(squashed):
     """Whatever its shape: ways of half a radian are chords, which an inertia of one end of them would misread."""
     spin, size = (0.3, 0.0, -0.4), torch.tensor([1.0, 1.0, squashed])
     turn = torch.linalg.matrix_exp(cross_matrix(spin))
@@ -74,7 +74,7 @@ def test_a_whole_body_may_tumble(squashed):
     assert_close_relative_to_max(rigid, way.mean(0) + arms @ turn.T - arms, 0.02)
 
 
-def test_untrained_a_body_flies_and_turns_on_and_knows_how():
+def test_untrained_rollout_continues_rigid_motion():
     dynamics = make_dynamics(dataclasses.replace(CARRYING, zero_init=True))
     steps = rollout(dynamics, flying(), 6, max_steps=2)
     assert_close_relative_to_max(steps[-1].means - 1, turning(8).means[1400:] - 1, 0.03)
@@ -88,12 +88,12 @@ def test_velocity_is_last_displacement():
     assert step.velocity[step.activity == DYNAMIC].any() and not step.velocity[step.activity == FROZEN].any()
 
 
-def test_what_carries_none_rests():
+def test_particles_without_velocity_rest():
     history = turning(2)
     assert history.velocity is None and not velocities(history).any()
 
 
-def test_an_impulse_is_part_of_it_at_once():
+def test_impulse_changes_velocity_of_whole_body():
     """Whatever the history says."""
     still = torch.tensor([0.0, 0.01, 0.0]).expand(200, 3)
     history = flying()
@@ -104,7 +104,7 @@ def test_an_impulse_is_part_of_it_at_once():
     assert_close_relative_to_max(rigid, still, 1e-3)
 
 
-def test_what_holds_some_rows_turns_the_body():
+def test_stopped_particles_turn_body():
     """Friction: rows below stop, those above go on; the body falls forward about them."""
     before = turning(1)
     low = before.means[:, 2] < 0.85
@@ -115,8 +115,8 @@ def test_what_holds_some_rows_turns_the_body():
     assert_close_relative_to_max(rigid.mean(0), step.mean(0), 0.2)
 
 
-def test_a_place_that_is_none_spoils_nothing():
-    """Neither features of other particles nor a gradient."""
+def test_invalid_position_changes_no_other_particle():
+    """Neither features of others nor gradients."""
     history = flying()
     means = history.means.clone()
     means[250] = torch.nan
@@ -129,7 +129,75 @@ def test_a_place_that_is_none_spoils_nothing():
     assert broken.velocity.grad.isfinite().all()
 
 
-def test_compiled_it_is_the_same(device):
+@pytest.mark.parametrize("n", [40, 1500])
+def test_gradients_of_velocities(n):
+    """Of 1,500 rows 1,024 are looked at."""
+    history = flying(n=n)
+    history = dataclasses.replace(history, means=history.means.double())
+    velocity = history.velocity.double().requires_grad_()
+
+    def of(velocity):
+        return velocities(dataclasses.replace(history, velocity=velocity))
+
+    assert torch.autograd.gradcheck(of, (velocity,), atol=1e-6, fast_mode=n > 100)
+
+
+def test_velocity_gradient_over_rollout():
+    dynamics, history = make_dynamics(dataclasses.replace(CARRYING, zero_init=True)), flying()
+    velocity = history.velocity.requires_grad_()
+    end = rollout(dynamics, history, 4, max_steps=2)[-1]
+    (gradient,) = torch.autograd.grad(end.means[:, 0].sum(), [velocity])
+    assert_close_relative_to_max(gradient[-200:, 0].sum(), torch.tensor(800.0), 0.05)
+
+
+def test_free_body_keeps_spin():
+    dynamics = make_dynamics(dataclasses.replace(CARRYING, zero_init=True))
+    steps = rollout(dynamics, flying(2, velocity=(0.0, 0.0, 0.0), spin=(0.0, 0.03, 0.0)), 20, max_steps=2)
+    before, after = (step.means - step.means.mean(0) for step in steps[-2:])
+    turned = torch.linalg.cross(before, after).mean(0)[1] / before[:, [0, 2]].square().sum(1).mean()
+    assert 0.97 < turned / 0.03 < 1.03
+
+
+@pytest.mark.parametrize("of", [0, 1, 2])
+def test_gains_scale_each_velocity(of):
+    dynamics, history = make_dynamics(dataclasses.replace(CARRYING, zero_init=True)), flying(3)
+    motions = velocities(history)
+    dynamics.priors.get("inertia").gain_head.bias.detach()[3 * of : 3 * of + 3] = 2 * torch.tensor(-0.2).atanh()
+    expected = motions[:, 1] - 0.4 * motions[:, of]
+    assert_close_relative_to_max(dynamics(history).means - last_steps(history, 1).means, expected, 1e-3)
+
+
+def test_batch_equals_single_scenes():
+    scenes = [flying(seed=1), flying(velocity=(0.0, 0.0, -0.05), seed=2)]
+    together = velocities(batch(scenes))
+    assert_close_relative_to_max(together, torch.cat([velocities(scene) for scene in scenes]), 1e-5)
+
+
+def test_edits_of_velocities():
+    history = flying()
+    turned = Rotate(axis=(0.0, 0.0, 1.0), degrees=90).apply(history, None)
+    assert_close_relative_to_max(turned.velocity[:, 1], history.velocity[:, 0], 1e-6)
+    thrown = Throw(velocity=(0.0, 0.02, 0.0)).apply(history, None)
+    added = torch.tensor([0.0, 0.02, 0.0]).expand(400, 3)
+    assert_close_relative_to_max(thrown.velocity - history.velocity, added, 1e-5)
+
+
+def test_network_reads_features():
+    """Without the columns that read it the next step is another one."""
+    dynamics, history = make_dynamics(CARRYING), flying()
+    torch.nn.init.normal_(dynamics.priors.get("inertia").in_proj.weight)
+    step = dynamics(history)
+    with torch.no_grad():
+        dynamics.priors.get("inertia").in_proj.weight[:] = 0
+    assert (dynamics(history).dynamic_latents - step.dynamic_latents).abs().max() > 1e-6
+
+
+def test_on_gpu(devices):
+    expected, actual = (velocities(flying().to(device)).cpu() for device in devices)
+    assert_close_relative_to_max(actual, expected, 1e-5)
+
+
+def test_compiled(device):
     history = flying().to(device)
     history.clouds
     priors, compiled = build(history, InertiaConfig(radius=LENGTH)), torch.compile(velocities, fullgraph=True)
@@ -139,7 +207,7 @@ def test_compiled_it_is_the_same(device):
 TURNING = with_priors(TINY, InertiaConfig(radius=LENGTH, rotate_appearance=True), zero_init=True)
 
 
-def test_what_is_drawn_turns_with_the_body_and_what_is_frozen_does_not():
+def test_orientations_follow_body():
     """Also on from where an edit turned it to."""
     history = flying()
     frozen = torch.arange(400) % 200 < 5
@@ -156,15 +224,15 @@ def test_what_is_drawn_turns_with_the_body_and_what_is_frozen_does_not():
     assert_close_relative_to_max(rotation_matrices(again)[5:], one.expand(195, 3, 3), 0.02)
 
 
-def test_without_turning_nothing_turns():
+def test_orientations_absent_without_rotated_appearance():
     assert make_dynamics(CARRYING)(flying()).orientations is None
 
 
-def test_where_there_is_nothing_nothing_turns():
+def test_orientations_of_empty_or_invalid_scene():
     """Nor where a place is none."""
     history = flying()
-    none = history.select_rows(torch.zeros(history.n_rows, dtype=torch.bool))
-    assert make_dynamics(TURNING)(none).orientations.shape == (0, 4)
+    empty = history.select_rows(torch.zeros(history.n_rows, dtype=torch.bool))
+    assert make_dynamics(TURNING)(empty).orientations.shape == (0, 4)
     means = history.means.clone()
     means[250] = torch.nan
     found = make_dynamics(TURNING)(dataclasses.replace(history, means=means)).orientations
@@ -173,14 +241,14 @@ def test_where_there_is_nothing_nothing_turns():
     assert_close_relative_to_max(found[others], make_dynamics(TURNING)(history).orientations[others], 0.02)
 
 
-def test_scenes_turn_each_for_itself():
+def test_orientations_of_batch_equal_single_scenes():
     one, other = flying(), flying(n=150, seed=3, spin=(0.1, 0.0, 0.0))
     both = make_dynamics(TURNING)(batch([one, other])).orientations
     alone = torch.cat([make_dynamics(TURNING)(q).orientations for q in (one, other)])
     assert_close_relative_to_max(both, alone, 1e-5)
 
 
-def test_a_gpu_turns_the_same(devices):
+def test_orientations_on_gpu(devices):
     history = flying()
     expected, actual, again = (
         make_dynamics(TURNING).to(d)(history.to(d)).orientations.cpu() for d in (*devices, devices[1])
@@ -189,7 +257,7 @@ def test_a_gpu_turns_the_same(devices):
     assert_same_bits(again, actual)
 
 
-def test_compiled_it_turns_the_same(device):
+def test_orientations_compiled(device):
     history = flying().to(device)
     last = last_steps(history, 1)
     last.clouds

@@ -23,7 +23,7 @@ TOWARDS = SLANTED[0] / SLANTED[0].norm()
 LIT = with_priors(TINY, LAMBERT, grid_size=CELL)
 
 
-def shaded(history, lights, cell, facing=None):
+def irradiance(history, lights, cell, facing=None):
     """[N, L] twice, the irradiance and the cosine of the newest particles."""
     return lambert(Movable(history, cell), lights, cell, LAMBERT, facing)
 
@@ -49,9 +49,9 @@ def softened(cosine):
 
 
 @pytest.mark.parametrize("n", [600, 2000])
-def test_a_ball_is_lit_by_the_angle_between_its_surface_and_the_light(n):
+def test_cosine_of_ball(n):
     history = scene(n)
-    lit, facing = shaded(history, SLANTED, CELL)
+    lit, facing = irradiance(history, SLANTED, CELL)
     _, (places, of_ball) = parts(history, torch.cat([lit, facing], 1))
     expected = softened(F.normalize(places, dim=1) @ TOWARDS)
     assert (of_ball[:, 1] - expected).abs().mean() < 0.03
@@ -60,10 +60,10 @@ def test_a_ball_is_lit_by_the_angle_between_its_surface_and_the_light(n):
 
 
 @pytest.mark.parametrize("light", [(0.0, 0.0, 1.0), (0.0, 0.0, 0.02), (0.6, 0.0, 0.8), (-0.3, 0.5, 0.8)])
-def test_a_shadow_falls_on_the_ground_where_the_light_does_not(light):
+def test_shadow_on_ground(light):
     light, history = torch.tensor([light]), scene()
     towards = light[0] / light.norm()
-    lit, facing = shaded(history, light, CELL)
+    lit, facing = irradiance(history, light, CELL)
     (places, of_ground), _ = parts(history, torch.cat([lit, facing], 1))
     off = torch.linalg.cross(torch.tensor([0.0, 0.0, HEIGHT]) - places, towards.expand_as(places)).norm(dim=1)
     share = of_ground[:, 0] / of_ground[:, 1]
@@ -71,22 +71,22 @@ def test_a_shadow_falls_on_the_ground_where_the_light_does_not(light):
     assert share[off < RADIUS].max() < 0.1 and share[off > RADIUS + 0.1].min() > 0.95
 
 
-def test_a_sheet_shows_the_light_its_front():
+def test_sheet_faces_light():
     ticks = torch.arange(30) * 0.03
     x, y = (v.flatten() for v in torch.meshgrid(ticks, ticks, indexing="ij"))
     history = opaque(make_history((len(x),), frozen_share=0.0))
     history = dataclasses.replace(history, means=torch.stack([1 + x, 1 + y, 1 + 0 * x], 1))
-    lit, facing = shaded(history, SLANTED, CELL)
+    lit, facing = irradiance(history, SLANTED, CELL)
     assert_close_relative_to_max(facing[:, 0], softened(TOWARDS[2]).expand(len(x)), 0.01)
     assert (lit / facing).min() > 0.9
 
 
-def test_many_rows_stand_in_the_light_as_few_do():
-    few, many = (parts(h, shaded(h, SLANTED, CELL)[0])[0][1] for h in (scene(700), scene(4000)))
+def test_shadow_is_independent_of_number_of_particles():
+    few, many = (parts(h, irradiance(h, SLANTED, CELL)[0])[0][1] for h in (scene(700), scene(4000)))
     assert (few - many).abs().mean() < 0.02 and few.min() < 0.3
 
 
-def test_what_rests_or_is_transparent_casts_no_shadow():
+def test_frozen_sleeping_or_transparent_particles_cast_no_shadow():
     over = scene()
     for activity, opacity in ((FROZEN, 0.8), (ASLEEP, 0.8), (DYNAMIC, 0.1)):
         moves = over.activity == DYNAMIC
@@ -95,31 +95,31 @@ def test_what_rests_or_is_transparent_casts_no_shadow():
             activity=torch.where(moves, activity, over.activity).to(torch.uint8),
             opacities=torch.where(moves, opacity, over.opacities),
         )
-        lit, facing = shaded(changed, SLANTED, CELL)
+        lit, facing = irradiance(changed, SLANTED, CELL)
         assert_same_bits(lit, facing)
 
 
-def test_what_is_known_of_rows_that_rest_is_kept():
+def test_known_cosines_of_frozen_particles_are_kept():
     history = scene()
-    lit, facing = shaded(history, SLANTED, CELL)
-    again = shaded(history, SLANTED, CELL, facing=facing)
+    lit, facing = irradiance(history, SLANTED, CELL)
+    again = irradiance(history, SLANTED, CELL, facing=facing)
     assert_same_bits(again[0], lit)
     moves = last_steps(history, 1).activity == DYNAMIC
-    half = shaded(history, SLANTED, CELL, facing=0.5 * facing)
+    half = irradiance(history, SLANTED, CELL, facing=0.5 * facing)
     assert_close_relative_to_max(half[0][~moves], 0.5 * lit[~moves], 1e-6)
     assert_same_bits(half[0][moves], lit[moves])
 
 
-def test_turning_the_light_changes_it_as_its_gradient_says():
+def test_direction_gradient_matches_finite_difference():
     history = scene(300)
     history = dataclasses.replace(history, means=history.means.double())
     light = torch.tensor([[0.2, 0.1, 0.5]], dtype=torch.float64, requires_grad=True)
     weights = torch.rand(last_steps(history, 1).n_rows, 1, dtype=torch.float64)
-    _, known = shaded(history, light.detach(), CELL)
+    _, known = irradiance(history, light.detach(), CELL)
 
     def total(x):
         """Of the ground: where rays of the ball begin is no function of the light to the gradient."""
-        lit = shaded(history, x, CELL, facing=known)[0]
+        lit = irradiance(history, x, CELL, facing=known)[0]
         return (lit * weights)[last_steps(history, 1).activity == FROZEN].sum()
 
     (gradient,) = torch.autograd.grad(total(light), [light])
@@ -130,57 +130,59 @@ def test_turning_the_light_changes_it_as_its_gradient_says():
         assert abs(float(difference - gradient[0, axis])) < 1e-3 * float(gradient.abs().max())
 
 
-def test_scenes_do_not_see_each_other_and_rows_have_no_order():
+def test_batch_equals_single_scenes_in_any_order():
     one, other = scene(200), opaque(make_history((7, 50), seed=1))
-    both = torch.cat(shaded(batch([one, other]), SLANTED, CELL), 1)
-    alone = torch.cat([torch.cat(shaded(q, SLANTED, CELL), 1) for q in (one, other)])
+    both = torch.cat(irradiance(batch([one, other]), SLANTED, CELL), 1)
+    alone = torch.cat([torch.cat(irradiance(q, SLANTED, CELL), 1) for q in (one, other)])
     assert_close_relative_to_max(both, alone, 2e-3)  # the normals of a few rows without order depend on rounding
     shuffled, order = permute_rows(one)
     newest = order[one.cu_rows[-2] :] - one.cu_rows[-2]
-    assert_close_relative_to_max(shaded(shuffled, SLANTED, CELL)[0], shaded(one, SLANTED, CELL)[0][newest], 2e-3)
+    assert_close_relative_to_max(
+        irradiance(shuffled, SLANTED, CELL)[0], irradiance(one, SLANTED, CELL)[0][newest], 2e-3
+    )
 
 
 @pytest.mark.parametrize("n_rows", [(0, 50), (1, 1)])
-def test_where_nothing_moves_nothing_is_in_the_way(n_rows):
-    lit, facing = shaded(opaque(make_history(n_rows, frozen_share=1.0)), SLANTED, CELL)
+def test_no_shadow_without_movable_particles(n_rows):
+    lit, facing = irradiance(opaque(make_history(n_rows, frozen_share=1.0)), SLANTED, CELL)
     assert lit.shape == facing.shape == (n_rows[-1], 1)
     assert_same_bits(lit, facing)
 
 
-def test_no_number_it_cannot_use_gets_out():
+def test_invalid_positions_give_finite_results():
     history = scene()
     means = history.means.clone()
     means[-1], means[-5], means[-2200] = torch.nan, torch.inf, torch.nan
-    for found in shaded(dataclasses.replace(history, means=means), SLANTED, CELL):
+    for found in irradiance(dataclasses.replace(history, means=means), SLANTED, CELL):
         assert found.isfinite().all() and found.any()
 
 
-def test_a_row_without_neighbours_has_a_light():
+def test_isolated_particle():
     """Far from all others, where a window holds one row or none."""
     history = scene()
     means = history.means.clone()
     means[-3:] += torch.tensor([[5.0, 0.0, 0.0], [0.0, 7.0, 0.0], [0.0, 0.0, 9.0]])
-    lit, facing = shaded(dataclasses.replace(history, means=means), SLANTED, CELL)
+    lit, facing = irradiance(dataclasses.replace(history, means=means), SLANTED, CELL)
     assert (lit >= 0).all() and (facing <= 1).all() and facing.isfinite().all()
 
 
-def test_a_gpu_finds_the_same(devices):
+def test_on_gpu(devices):
     history = batch([scene(600), opaque(make_history((30, 40)))])
-    expected, actual = (torch.cat(shaded(history.to(d), SLANTED.to(d), CELL), 1).cpu() for d in devices)
+    expected, actual = (torch.cat(irradiance(history.to(d), SLANTED.to(d), CELL), 1).cpu() for d in devices)
     assert (actual - expected).abs().mean() < 1e-3
-    assert_same_bits(torch.cat(shaded(history.to(devices[1]), SLANTED.to(devices[1]), CELL), 1).cpu(), actual)
+    assert_same_bits(torch.cat(irradiance(history.to(devices[1]), SLANTED.to(devices[1]), CELL), 1).cpu(), actual)
 
 
-def test_compiled_it_is_the_same(device):
+def test_compiled(device):
     history, lights = scene(50).to(device), SLANTED.to(device)
     history.clouds
-    compiled = torch.compile(shaded, fullgraph=True)
-    for actual, expected in zip(compiled(history, lights, CELL), shaded(history, lights, CELL)):
+    compiled = torch.compile(irradiance, fullgraph=True)
+    for actual, expected in zip(compiled(history, lights, CELL), irradiance(history, lights, CELL)):
         assert_close_relative_to_max(actual, expected, 1e-3)
 
 
 @pytest.mark.parametrize("background", ["symmetric", "relightable"])
-def test_colours_follow_the_light(background):
+def test_irradiance_gain_is_ratio_times_prediction(background):
     """That of where rows are over that of where they were encoded, times what is predicted."""
     dynamics, history = make_dynamics(dataclasses.replace(LIT, zero_init=True, background=background)), scene(600)
     strength = torch.tensor([[0.8, 1.0, 1.2], [0.1, 0.0, 0.3]])
@@ -189,7 +191,7 @@ def test_colours_follow_the_light(background):
     newest = last_steps(known, 1)
     lit, facing, now = newest.light_occlusion.split(2, 1)
     assert_same_bits(lit, now)
-    found = shaded(history, light_of(dynamics).directions, CELL)
+    found = irradiance(history, light_of(dynamics).directions, CELL)
     assert_close_relative_to_max(lit, found[0], 1e-6)
     assert_close_relative_to_max(facing, found[1], 1e-6)
     assert (known.light_occlusion[: -newest.n_rows] == -1).all()
@@ -200,7 +202,7 @@ def test_colours_follow_the_light(background):
     step = dynamics(moved)
     then, now = (
         (1 + values @ strength)
-        for values in (lit, shaded(moved, light_of(dynamics).directions, CELL, facing=facing)[0])
+        for values in (lit, irradiance(moved, light_of(dynamics).directions, CELL, facing=facing)[0])
     )
     assert_close_relative_to_max(step.irradiance_gain, now / then, 1e-4)
     assert step.irradiance_gain[~moves].min() < 0.6 and step.irradiance_gain[~moves].max() > 1.5
@@ -210,7 +212,7 @@ def test_colours_follow_the_light(background):
     assert_close_relative_to_max(dynamics(moved).irradiance_gain, step.irradiance_gain * more, 1e-4)
 
 
-def test_the_light_reaches_all_whoever_may_change_but_not_rows_that_are_held():
+def test_irradiance_changes_all_but_frozen_appearance():
     dynamics, history = make_dynamics(LIT), scene(300)
     torch.nn.init.normal_(light_of(dynamics).gain_head.weight, std=0.1)
     known = dynamics.initialize(history)
@@ -230,7 +232,7 @@ def test_the_light_reaches_all_whoever_may_change_but_not_rows_that_are_held():
     assert (light["none"][~moves] - light["dynamic"][~moves]).abs().max() < 0.2
 
 
-def test_the_network_reads_it_and_training_reaches_strength_and_direction():
+def test_light_parameters_have_gradients():
     dynamics, history = make_dynamics(LIT), scene(100)
     torch.nn.init.normal_(light_of(dynamics).gain_head.weight)
     known = dynamics.initialize(history)
@@ -244,7 +246,7 @@ def test_the_network_reads_it_and_training_reaches_strength_and_direction():
     assert light_of(dynamics).in_proj.weight.grad.abs().amax(0).gt(0).all()
 
 
-def test_a_step_of_training_turns_a_lamp_by_little():
+def test_optimizer_step_turns_direction_slowly():
     dynamics = make_dynamics(LIT)
     before, rate = F.normalize(light_of(dynamics).directions.detach(), dim=1), 1e-3
     light_of(dynamics).directions.grad = torch.tensor([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
@@ -253,11 +255,11 @@ def test_a_step_of_training_turns_a_lamp_by_little():
     assert turned.gt(0).all() and turned.max() < 0.1 * rate
 
 
-def test_rows_that_were_not_encoded_are_lit_as_where_they_begin():
+def test_encoding_time_defaults_to_start():
     dynamics, history = make_dynamics(dataclasses.replace(LIT, zero_init=True)), scene(300)
     step = dynamics(history)
     assert (step.irradiance_gain - 1).abs().max() < 1e-5
     assert_close_relative_to_max(
-        step.light_occlusion[:, :2], shaded(history, light_of(dynamics).directions, CELL)[0], 0.3
+        step.light_occlusion[:, :2], irradiance(history, light_of(dynamics).directions, CELL)[0], 0.3
     )
     assert (step.light_occlusion >= 0).all()

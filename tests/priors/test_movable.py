@@ -39,7 +39,7 @@ def most(history):
     return max(int(moves[a:b].sum()) for a, b in ((40, 80), (105, 130)))
 
 
-def test_rows_that_may_move_are_found_in_their_order(device):
+def test_movable_particles_keep_order(device):
     history = scenes(device)
     exact, roomy, everything = (Movable(history, TINY.grid_size, n) for n in (most(history), 35, 40))
     assert exact.particles.rows.shape[1] == most(history) < 40
@@ -51,19 +51,19 @@ def test_rows_that_may_move_are_found_in_their_order(device):
             assert_same_bits(movable.particles.rows[b][movable.particles.known[b]], wanted)
         assert_same_bits(movable.samples.positions, exact.samples.positions)
     newest = torch.cat([history.means[40:80], history.means[105:]])
-    told = exact.padded(newest)
-    assert_same_bits(told, torch.where(exact.particles.known[:, :, None], told, 0))
+    padded = exact.padded(newest)
+    assert_same_bits(padded, torch.where(exact.particles.known[:, :, None], padded, 0))
     moves = torch.cat([((history.activity == DYNAMIC) & inside)[a:b] for a, b in ((40, 80), (105, 130))])
-    assert_same_bits(exact.packed(told), torch.where(moves[:, None], newest, 0))
+    assert_same_bits(exact.packed(padded), torch.where(moves[:, None], newest, 0))
 
 
-def test_gradients_go_where_rows_came_from():
+def test_packing_gradients():
     movable = Movable(scenes(), TINY.grid_size, 33)
     values = torch.randn(65, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
     assert torch.autograd.gradcheck(lambda x: movable.packed(movable.padded(x) ** 2), values)
 
 
-def test_room_for_more_changes_nothing(device):
+def test_capacity_of_movable_particles_changes_nothing(device):
     history, dynamics = scenes(device), make_dynamics(TOLD).to(device)
     gains = [prior.gain_head for prior in dynamics.priors if prior.gain_head]
     for parameter in (p for module in (dynamics.net.head, *gains) for p in module.parameters()):

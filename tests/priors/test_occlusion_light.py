@@ -1,4 +1,4 @@
-"""Light occlusion of particles, and a network that reads it."""
+"""Occlusion of distant lights, and a network that reads it."""
 
 import copy
 import dataclasses
@@ -58,7 +58,7 @@ def ground_of(history, lights=ZENITH):
 
 
 @pytest.mark.parametrize("light", [(0.0, 0.0, 1.0), (0.0, 0.0, 0.02), (0.6, 0.0, 0.8), (-0.3, 0.5, 0.8)])
-def test_a_shadow_falls_where_the_light_does_not(light):
+def test_optical_depth_of_shadow(light):
     light = torch.tensor([light])
     shaded, places = ground_of(under_a_ball(), light)
     way = torch.tensor([0.0, 0.0, HEIGHT]) - places
@@ -68,7 +68,7 @@ def test_a_shadow_falls_where_the_light_does_not(light):
     assert shaded[inside].min() > 1 and shaded[outside].max() < 0.1
 
 
-def test_the_far_side_of_a_body_is_in_its_own_shade():
+def test_far_side_of_body_is_occluded():
     history = under_a_ball(2000)
     newest = last_steps(history, 1)
     shaded = shade(history, ZENITH, CELL)[newest.activity == DYNAMIC][:, 0]
@@ -76,7 +76,7 @@ def test_the_far_side_of_a_body_is_in_its_own_shade():
     assert shaded[height > 0.8 * RADIUS].mean() < 0.3 and shaded[height < -0.7 * RADIUS].min() > 2
 
 
-def test_bodies_behind_the_light_and_what_rests_cast_none():
+def test_bodies_behind_light_or_at_rest_occlude_nothing():
     below = under_a_ball(height=-HEIGHT)
     assert ground_of(below)[0].max() < 1e-6
     over = under_a_ball()
@@ -85,12 +85,12 @@ def test_bodies_behind_the_light_and_what_rests_cast_none():
         assert not shade(dataclasses.replace(over, activity=rests), ZENITH, CELL).any()
 
 
-def test_of_many_rows_some_stand_for_all():
+def test_samples_stand_for_all_particles():
     few, many = (ground_of(under_a_ball(n))[0].exp() - 1 for n in (SAMPLES, 4 * SAMPLES))
     assert abs(float(many.sum() / few.sum()) - 4) < 0.2
 
 
-def test_turning_the_light_changes_it_as_its_gradient_says():
+def test_direction_gradient_matches_finite_difference():
     """Along every axis, in float64, beside finite differences."""
     history = under_a_ball(300)
     history = dataclasses.replace(history, means=history.means.double())
@@ -108,7 +108,7 @@ def test_turning_the_light_changes_it_as_its_gradient_says():
         assert abs(float(difference - gradient[0, axis])) < 1e-4 * float(gradient.abs().max())
 
 
-def test_scenes_do_not_see_each_other_and_rows_have_no_order():
+def test_batch_equals_single_scenes_in_any_order():
     one, other = under_a_ball(200), make_history((7, 50), seed=1)
     both = shade(batch([one, other]), ZENITH, CELL)
     assert_close_relative_to_max(both, torch.cat([shade(q, ZENITH, CELL) for q in (one, other)]), 1e-5)
@@ -117,19 +117,19 @@ def test_scenes_do_not_see_each_other_and_rows_have_no_order():
     assert_close_relative_to_max(shade(shuffled, ZENITH, CELL), shade(one, ZENITH, CELL)[newest], 1e-5)
 
 
-def test_far_from_the_origin_it_is_as_exact():
+def test_far_from_origin():
     near = under_a_ball()
     far = dataclasses.replace(near, means=near.means + 500, origin=near.origin + 500)
     assert_close_relative_to_max(shade(far, ZENITH, CELL), shade(near, ZENITH, CELL), 0.01)
 
 
 @pytest.mark.parametrize("n_rows", [(0, 50), (1, 1)])
-def test_where_nothing_moves_there_is_no_shade(n_rows):
+def test_optical_depth_without_movable_particles(n_rows):
     found = shade(make_history(n_rows, frozen_share=1.0), ZENITH, CELL)
     assert found.shape == (n_rows[-1], 1) and not found.any()
 
 
-def test_no_number_it_cannot_use_gets_out():
+def test_invalid_positions_give_finite_results():
     history = under_a_ball()
     means = history.means.clone()
     means[-1], means[-5], means[-2000] = torch.nan, torch.inf, torch.nan
@@ -137,22 +137,22 @@ def test_no_number_it_cannot_use_gets_out():
     assert found.isfinite().all() and found.any()
 
 
-def test_a_gpu_finds_the_same(devices):
+def test_on_gpu(devices):
     history, lights = batch([under_a_ball(), make_history((30, 40))]), torch.tensor([[0.2, 0.1, 0.5]])
     expected, actual = (shade(history.to(device), lights.to(device), CELL).cpu() for device in devices)
     assert_close_relative_to_max(actual, expected, 1e-4)
     assert_same_bits(shade(history.to(devices[1]), lights.to(devices[1]), CELL).cpu(), actual)
 
 
-def test_compiled_it_is_the_same(device):
+def test_compiled(device):
     history, lights = under_a_ball(50).to(device), ZENITH.to(device)
     history.clouds
     compiled = torch.compile(shade, fullgraph=True)
     assert_close_relative_to_max(compiled(history, lights, CELL), shade(history, lights, CELL), 1e-4)
 
 
-def test_the_network_reads_it_and_turns_its_lights():
-    """Without the columns that read it the next step is another one. Training gets the irradiance of a step."""
+def test_network_reads_occlusion_and_direction_has_gradient():
+    """Without the columns that read it the next step is another one. Gradients come from the irradiance of a step."""
     dynamics, history = make_dynamics(LIT), under_a_ball(100)
     torch.nn.init.normal_(light_of(dynamics).in_proj.weight)
     torch.nn.init.normal_(light_of(dynamics).gain_head.weight)
@@ -167,18 +167,18 @@ def test_the_network_reads_it_and_turns_its_lights():
         assert (other(history).dynamic_latents - step.dynamic_latents).abs().max() > 1e-5
 
 
-def without_light(n_rows, n_lights=2):
+def unoccluded(n_rows, n_lights=2):
     return torch.zeros(n_rows, n_lights)
 
 
 @pytest.mark.parametrize("background", ["symmetric", "relightable"])
-def test_light_is_that_of_where_rows_are_over_that_of_where_they_were_encoded(background):
+def test_irradiance_gain_compares_now_with_encoding(background):
     config = dataclasses.replace(LIT, zero_init=True, background=background)
     dynamics, history = make_dynamics(config), under_a_ball()
     light_of(dynamics).extinction.data = torch.tensor([[0.3, 0.2, 0.1], [0.0, 0.1, 0.2]])
     shaded = shade(history, torch.tensor(LIGHTS), LIT.grid_size)
     assert shaded.amin(0).max() < 0.1 and shaded.amax(0).min() > 2
-    began = 0.5 + without_light(history.n_rows)
+    began = 0.5 + unoccluded(history.n_rows)
     step = dynamics(dynamics.initialize(dataclasses.replace(history, light_occlusion=began)))
     expected = (2 * (((0.5 - shaded) @ light_of(dynamics).extinction) / 2).tanh()).exp()
     assert_close_relative_to_max(step.irradiance_gain, expected, 1e-5)
@@ -192,13 +192,13 @@ def test_light_is_that_of_where_rows_are_over_that_of_where_they_were_encoded(ba
     assert_close_relative_to_max(brighter, (2 * (change / 2).tanh()).exp().expand_as(brighter), 1e-5)
 
 
-def test_light_does_not_add_up_and_is_not_of_rows_that_keep_their_look():
+def test_irradiance_gain_does_not_accumulate():
     """It is asked anew in every step, of the places at which bodies are then."""
     dynamics, history = make_dynamics(dataclasses.replace(LIT, zero_init=True)), under_a_ball()
     held = torch.zeros(history.n_rows, dtype=torch.bool)
     held[::3] = True
     history = dynamics.initialize(
-        dataclasses.replace(history, light_occlusion=0.5 + without_light(history.n_rows), frozen_appearance=held)
+        dataclasses.replace(history, light_occlusion=0.5 + unoccluded(history.n_rows), frozen_appearance=held)
     )
     for who in ("all", "dynamic", "frozen", "none"):
         first, *_, last = rollout(partial(dynamics, changes=dynamics.layout.changes(who)), history, 3, 2)
@@ -208,7 +208,7 @@ def test_light_does_not_add_up_and_is_not_of_rows_that_keep_their_look():
         assert_same_bits(last.irradiance_gain, first.irradiance_gain)  # nothing moved
 
 
-def test_encoded_rows_know_what_stood_in_their_light():
+def test_encoded_particles_have_light_occlusion():
     dynamics, history = make_dynamics(LIT), under_a_ball(n_steps=2)
     known = dynamics.initialize(history)
     newest = known.row_cloud() == 1
@@ -233,8 +233,8 @@ def test_asymmetric_background_is_refused():
 
 
 @pytest.mark.parametrize("light", [OCCLUSION, LAMBERT], ids=["occlusion", "lambert"])
-def test_a_shadow_does_not_lag_behind_its_body(light):
-    """A step is lit as its rows are where it ends, and the next step reads that."""
+def test_shadow_follows_body_in_same_step(light):
+    """A step is lit as its particles are where it ends, and the next one begins with that."""
     config = with_priors(LIT, light, grid_size=CELL, zero_init=True)
     dynamics, history = make_dynamics(config), under_a_ball()
     names = [name for name, n in dynamics.layout.outputs for _ in range(n)]
@@ -251,7 +251,7 @@ def test_a_shadow_does_not_lag_behind_its_body(light):
 
 
 @pytest.mark.parametrize("light", [OCCLUSION, LAMBERT], ids=["occlusion", "lambert"])
-def test_rows_that_sleep_keep_what_they_knew(light):
+def test_sleeping_particles_keep_light_occlusion(light):
     config = with_priors(LIT, light, grid_size=CELL)
     dynamics, history = make_dynamics(config), under_a_ball()
     known = dynamics.initialize(history)

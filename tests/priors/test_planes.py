@@ -14,7 +14,7 @@ def _flat(n: int = 200) -> torch.Tensor:
     return points + torch.tensor([0.6, -0.5, 0.4])
 
 
-def test_the_normal_of_a_plane_is_found():
+def test_plane_normal():
     points = _flat()
     window = torch.full((1, 1, 200), 1 / 200)
     middle, normal = fit_planes(window, points, LENGTH)
@@ -23,7 +23,7 @@ def test_the_normal_of_a_plane_is_found():
 
 
 @pytest.mark.parametrize("error", (-1e-2, -1e-3, 1e-3, 1e-2))
-def test_products_that_are_rounded_like_those_of_tf32_have_a_normal(error):
+def test_plane_normal_with_tf32_rounding(error):
     # Sums of shares that are not 1: what is left of the spread has eigenvalues below 0 then, as rounding leaves them.
     window = torch.full((1, 1, 200), (1 + error) / 200)
     _, normal = fit_planes(window, _flat(), LENGTH)

@@ -1,4 +1,4 @@
-"""The way from movable particles to the static background, and a network that reads it."""
+"""The way from movable particles to the static background near them, and a network that reads it."""
 
 import dataclasses
 
@@ -43,33 +43,33 @@ def above_ground(heights, seed=0, slope=0.0, n_steps=2):
     )
 
 
-def features(history, heights):
+def way_and_proximity(history, heights):
     way, near = contact(history)[-len(heights) :].split([3, 1], 1)
     return way / near * LENGTH, near
 
 
-def test_over_a_plane_it_is_the_height_and_fades():
+def test_proximity_over_plane():
     heights = [0.02, 0.1, 0.2, 0.4]
-    way, near = features(above_ground(heights), heights)
+    way, near = way_and_proximity(above_ground(heights), heights)
     height = torch.tensor(heights)
     assert_close_relative_to_max(way[:, 2], -height, 0.01)
     assert way[:, :2].abs().max() < 0.01
     assert_close_relative_to_max(near[:, 0], (-0.5 * (height / LENGTH) ** 2).exp(), 0.02)
 
 
-def test_below_it_is_the_way_back():
-    way, near = features(above_ground([-0.06]), [-0.06])
+def test_direction_below_plane_points_to_surface():
+    way, near = way_and_proximity(above_ground([-0.06]), [-0.06])
     assert abs(float(way[0, 2]) - 0.06) < 0.003 and near > 0.9
 
 
-def test_of_a_slope_it_is_the_normal():
+def test_direction_over_slope_is_normal():
     slope, height = 0.5, 0.1
-    way, _ = features(above_ground([height], slope=slope), [height])
+    way, _ = way_and_proximity(above_ground([height], slope=slope), [height])
     normal = torch.tensor([slope, 0.0, -1.0]) / (1 + slope**2) ** 0.5
     assert_close_relative_to_max(way[0], normal * height / (1 + slope**2) ** 0.5, 0.1)
 
 
-def test_transparent_far_or_frozen_particles_have_no_proximity():
+def test_proximity_is_zero_without_opaque_frozen_neighbors():
     history = above_ground([0.1, 3.0])
     found = contact(history)
     frozen = last_steps(history, 1).activity == FROZEN
@@ -82,7 +82,7 @@ def test_transparent_far_or_frozen_particles_have_no_proximity():
     assert not contact(dataclasses.replace(history, activity=asleep)).any()
 
 
-def test_scenes_do_not_see_each_other_and_rows_have_no_order():
+def test_batch_equals_single_scenes_in_any_order():
     one, other = above_ground([0.1, 0.05]), above_ground([0.2], seed=1, n_steps=3)
     both = contact(batch([one, other]))
     assert_close_relative_to_max(both, torch.cat([contact(one), contact(other)]), 1e-5)
@@ -91,14 +91,14 @@ def test_scenes_do_not_see_each_other_and_rows_have_no_order():
     assert_close_relative_to_max(contact(other_order), contact(one)[newest], 1e-5)
 
 
-def test_far_from_the_origin_it_is_as_exact():
+def test_far_from_origin():
     heights = [0.02, 0.1, -0.05]
     near = above_ground(heights)
     far = dataclasses.replace(near, means=near.means + 500, origin=near.origin + 500)
     assert_close_relative_to_max(contact(far), contact(near), 1e-3)
 
 
-def test_no_number_it_cannot_use_gets_out():
+def test_invalid_positions_give_finite_results():
     history = above_ground([0.1])
     means = history.means.clone()
     means[-1], means[-5] = torch.nan, torch.inf
@@ -106,14 +106,14 @@ def test_no_number_it_cannot_use_gets_out():
     assert found.isfinite().all() and not found.any()
 
 
-def test_a_gpu_finds_the_same(devices):
+def test_on_gpu(devices):
     history = batch([above_ground([0.02, 0.1]), make_history((30, 40))])
     expected, actual = (contact(history.to(device)).cpu() for device in devices)
     assert_close_relative_to_max(actual, expected, 1e-4)
     assert_same_bits(contact(history.to(devices[1])).cpu(), actual)
 
 
-def test_compiled_it_is_the_same(device):
+def test_compiled(device):
     history = above_ground([0.02, 0.1]).to(device)
     history.clouds
     priors, compiled = build(history, NEAR), torch.compile(contact, fullgraph=True)
@@ -123,12 +123,12 @@ def test_compiled_it_is_the_same(device):
 @pytest.mark.parametrize("name", ["position_waves", "proximity"])
 def test_network_reads_features(name):
     dynamics, history = make_dynamics(TOLD), above_ground([0.02, 0.05])
-    untold = dynamics(history)
+    before = dynamics(history)
     torch.nn.init.normal_(dynamics.priors.get(name).in_proj.weight)
-    assert (dynamics(history).means - untold.means).abs().max() > 1e-5
+    assert (dynamics(history).means - before.means).abs().max() > 1e-5
 
 
-def test_waves_tell_places():
+def test_position_waves():
     history = above_ground([0.3])
     waves = position_waves(history, 3, 4.0).unflatten(1, (3, 2, 3))
     places = history.means.double() - history.origin[0]
@@ -138,9 +138,9 @@ def test_waves_tell_places():
         assert_close_relative_to_max(waves[:, k, 1], angles.cos(), 1e-6)
 
 
-def test_newest_background_matches_relightable_background():
-    relit = with_priors(TOLD, InertiaConfig(radius=0.2), background="relightable")
-    dynamics, history = make_dynamics(relit), above_ground([0.02, 0.05])
+def test_relightable_background_of_older_steps_is_ignored():
+    relightable = with_priors(TOLD, InertiaConfig(radius=0.2), background="relightable")
+    dynamics, history = make_dynamics(relightable), above_ground([0.02, 0.05])
     older = (history.activity == FROZEN) & (history.row_cloud() == 0)
     moved = dataclasses.replace(history, means=torch.where(older[:, None], history.means + 0.05, history.means))
     assert_same_bits(dynamics(moved).means, dynamics(history).means)

@@ -54,53 +54,53 @@ def scene(*parts, seed=0):
     return dataclasses.replace(history, means=places[order], origin=torch.zeros(1, 3).double()), part[order]
 
 
-def distinguished(history):
+def separated(history):
     """The middles that rows know, and the number of that of each."""
     return bodies(history).unique(dim=0, return_inverse=True)
 
 
-def test_bodies_with_a_gap_are_distinguished():
+def test_gap_separates_bodies():
     """Of 6 cm, where rows are 2 cm apart."""
     history, part = scene(shell(0.2, (1.0, 1.0, 1.0), 900), shell(0.15, (1.41, 1.0, 1.0), 500, seed=1))
-    middles, body = distinguished(history)
+    middles, body = separated(history)
     assert len(middles) == 2
     for k in range(2):
         assert (body[part == k] == body[part == k][0]).all()
         assert (middles[body[part == k][0]] - history.means[part == k].mean(0)).norm() < 0.02
 
 
-def test_a_body_with_a_hole_is_one():
-    middles, _ = distinguished(scene(tube(0.22, 0.07, (1.0, 1.0, 1.0), 900))[0])
+def test_body_with_hole():
+    middles, _ = separated(scene(tube(0.22, 0.07, (1.0, 1.0, 1.0), 900))[0])
     assert len(middles) == 1
 
 
-def test_a_small_part_and_rows_that_are_alone_belong_to_what_is_nearest():
+def test_small_clusters_join_nearest_body():
     g = generator()
     dust, lump = 1.0 + 0.4 * torch.randn(20, 3, generator=g), shell(0.03, (1.35, 1.0, 1.0), int(0.3 * MIN_SHARE * 600))
-    middles, body = distinguished(scene(shell(0.2, (1.0, 1.0, 1.0), 600), lump, dust)[0])
+    middles, body = separated(scene(shell(0.2, (1.0, 1.0, 1.0), 600), lump, dust)[0])
     assert len(middles) == 1 and not body.any()
 
 
-def test_a_part_of_some_size_is_a_body():
+def test_large_cluster_is_body():
     lump = shell(0.06, (1.4, 1.0, 1.0), int(2 * MIN_SHARE * 600))
-    assert len(distinguished(scene(shell(0.2, (1.0, 1.0, 1.0), 600), lump)[0])[0]) == 2
+    assert len(separated(scene(shell(0.2, (1.0, 1.0, 1.0), 600), lump)[0])[0]) == 2
 
 
-def test_many_rows_are_sampled():
+def test_more_particles_than_samples():
     parts = [shell(0.2, (1.0, 1.0, 1.0), 2 * SAMPLES), shell(0.2, (1.55, 1.0, 1.0), 2 * SAMPLES, seed=1)]
     history, part = scene(*parts)
-    middles, body = distinguished(history)
+    middles, body = separated(history)
     assert len(middles) == 2 and (body[part == 0] == body[part == 0][0]).all()
     assert (body[part == 1] != body[part == 0][0]).all()
 
 
 @pytest.mark.parametrize("n", [1, NEIGHBORS - 1, NEIGHBORS])
-def test_few_rows_are_one_body(n):
+def test_few_particles_are_one_body(n):
     history, _ = scene(1.0 + 0.3 * torch.rand(n, 3, generator=generator()))
-    assert len(distinguished(history)[0]) == 1
+    assert len(separated(history)[0]) == 1
 
 
-def test_rows_that_do_not_move_know_where_they_are_and_are_not_looked_at():
+def test_frozen_particles_are_not_segmented():
     history, _ = scene(shell(0.2, (1.0, 1.0, 1.0), 900))
     activity = history.activity.clone()
     activity[::2] = FROZEN
@@ -111,25 +111,25 @@ def test_rows_that_do_not_move_know_where_they_are_and_are_not_looked_at():
     assert_same_bits(found[1::2], bodies(alone))
 
 
-def test_no_rows_have_no_bodies():
+def test_segmentation_of_no_particles():
     assert bodies(scene(torch.zeros(0, 3))[0]).shape == (0, 3)
 
 
-def test_scenes_do_not_see_each_other():
+def test_batch_equals_single_scenes():
     one, other = scene(shell(0.2, (1.0, 1.0, 1.0), 700))[0], scene(shell(0.2, (1.2, 1.0, 1.0), 900, seed=2))[0]
     together = bodies(batch([one, other]))
     assert_close_relative_to_max(together, torch.cat([bodies(x) for x in (one, other)]), 1e-6)
     assert len(together.unique(dim=0)) == 2
 
 
-def test_they_move_with_the_scene():
+def test_segmentation_moves_with_scene():
     history, _ = scene(shell(0.2, (1.0, 1.0, 1.0), 700), shell(0.2, (1.55, 1.0, 1.0), 700, seed=1))
     far = torch.tensor([300.0, -200.0, 100.0])
     moved = dataclasses.replace(history, means=history.means + far, origin=history.origin + far)
     assert_close_relative_to_max(bodies(moved) - far, bodies(history), 1e-4)
 
 
-def test_windows_count_the_rows_of_one_body_and_no_others():
+def test_windows_of_segmented_particles_hold_one_body():
     history, part = scene(
         shell(0.2, (1.0, 1.0, 1.0), 300), shell(0.2, (1.55, 1.0, 1.0), 300, seed=1),
         shell(0.2, (1.2, 1.5, 1.1), 300, seed=2),
@@ -140,7 +140,7 @@ def test_windows_count_the_rows_of_one_body_and_no_others():
     torch.testing.assert_close(of_rows[0], one, atol=1e-3, rtol=0)
 
 
-def test_a_model_with_pushes_knows_bodies_from_the_beginning():
+def test_model_with_segmentation_keeps_bodies():
     history, _ = scene(shell(0.2, (1.0, 1.0, 1.0), 300), shell(0.2, (1.55, 1.0, 1.0), 300, seed=1))
     known = make_dynamics(SEGMENTED).begin(history)
     assert_same_bits(known.body, bodies(history))
@@ -149,7 +149,7 @@ def test_a_model_with_pushes_knows_bodies_from_the_beginning():
     assert_same_bits(make_dynamics(SEGMENTED).begin(later).body, known.body)
 
 
-def test_a_body_that_is_moved_or_copied_is_another_one():
+def test_edits_move_bodies():
     history, _ = scene(shell(0.2, (1.0, 1.0, 1.0), 300))
     known = dataclasses.replace(history, body=bodies(history))
     by = torch.tensor([0.5, 0.0, 0.25])
@@ -158,12 +158,12 @@ def test_a_body_that_is_moved_or_copied_is_another_one():
     assert len(both.body.unique(dim=0)) == 2 and both.n_rows == 2 * history.n_rows
 
 
-def test_rows_that_know_no_body_are_where_they_are():
+def test_default_body_is_position():
     history, _ = scene(shell(0.2, (1.0, 1.0, 1.0), 30))
     assert_same_bits(with_attribute(history, "body").body, history.means)
 
 
-def test_a_gpu_finds_the_same(devices):
+def test_on_gpu(devices):
     history, _ = scene(shell(0.2, (1.0, 1.0, 1.0), 700), shell(0.2, (1.55, 1.0, 1.0), 700, seed=1))
     expected, actual = (bodies(history.to(device)).cpu() for device in devices)
     assert_close_relative_to_max(actual, expected, 1e-6)

@@ -1,4 +1,4 @@
-"""Rest shapes of bodies, and the features that the network reads of them."""
+"""Rest shapes of bodies, and the displacements that restore them."""
 
 import dataclasses
 import math
@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from gsim3d.dynamics import last_steps, rollout
+from gsim3d.effects.edits import Move, Rotate
 from gsim3d.priors import InertiaConfig, ShapeMatchingConfig
 from gsim3d.priors.rigid import best_rotation
 from gsim3d.state import FROZEN
@@ -45,14 +46,14 @@ def random_rotations(n, dtype=torch.float64):
 
 
 @pytest.mark.parametrize("size", [(0.3, 0.3, 0.3), (0.3, 0.2, 0.0), (0.3, 0.05, 0.05)])
-def test_rotations_of_points_are_found(size):
+def test_best_rotation_of_points(size):
     g, turns = torch.Generator().manual_seed(1), random_rotations(50)
     points = torch.randn(50, 100, 3, generator=g, dtype=torch.float64) * torch.tensor(size, dtype=torch.float64)
     found = best_rotation((points @ turns.mT).mT @ points)
     torch.testing.assert_close(found, turns, atol=1e-6, rtol=0)
 
 
-def test_the_rotation_is_the_nearest_one():
+def test_best_rotation_matches_polar_decomposition():
     """Of products of any matrix, as the polar decomposition has it."""
     g = torch.Generator().manual_seed(2)
     products = torch.eye(3) + 0.3 * torch.randn(40, 3, 3, generator=g, dtype=torch.float64)
@@ -62,18 +63,18 @@ def test_the_rotation_is_the_nearest_one():
     torch.testing.assert_close(best_rotation(products), nearest, atol=1e-6, rtol=0)
 
 
-def test_of_nothing_it_is_none():
+def test_best_rotation_of_nothing():
     assert not best_rotation(torch.zeros(2, 3, 3)).any()
 
 
 @pytest.mark.parametrize("degrees", [0, 60, 180])
-def test_a_body_that_moves_and_turns_is_not_bent(degrees):
+def test_rigid_motion_has_no_residual(degrees):
     turn = torch.linalg.matrix_exp(math.radians(degrees) * torch.tensor([[0.0, -0.6, 0.8], [0.6, 0, 0], [-0.8, 0, 0]]))
     assert residual(bent(turn)).abs().max() < 1e-5
 
 
 @pytest.mark.parametrize("turn", [torch.eye(3), QUARTER])
-def test_squeezed_body_residual_points_to_rest_shape(turn):
+def test_residual_of_squeezed_body(turn):
     """In a window that is larger than the body, so that all of it counts."""
     history = bent(turn @ SQUEEZED)
     way = residual(history, 1.0)
@@ -81,20 +82,20 @@ def test_squeezed_body_residual_points_to_rest_shape(turn):
     assert_close_relative_to_max(way, expected - expected.mean(0), 0.05)
 
 
-def test_residual_in_window_of_body_size():
+def test_residual_in_small_window():
     history = bent(SQUEEZED)
     way = residual(history, 0.05)
     top = history.rest_positions[:, 2] > 1.08
     assert 0.002 < way[top, 2].mean() < 0.028
 
 
-def test_scenes_do_not_see_each_other():
+def test_batch_equals_single_scenes():
     scenes = [bent(SQUEEZED), bent(QUARTER @ SQUEEZED, seed=2)]
     together = residual(batch(scenes))
     assert_close_relative_to_max(together, torch.cat([residual(scene) for scene in scenes]), 1e-4)
 
 
-def test_frozen_rows_are_not_bent_and_do_not_count():
+def test_frozen_particles_have_no_residual():
     history = bent(SQUEEZED, frozen_share=0.3)
     frozen = history.activity == FROZEN
     way = residual(history)
@@ -102,14 +103,14 @@ def test_frozen_rows_are_not_bent_and_do_not_count():
     assert_close_relative_to_max(way[~frozen], residual(history.select_rows(~frozen)), 1e-4)
 
 
-def test_nothing_is_bent_where_nothing_is_or_nothing_is_remembered():
+def test_residual_without_particles_or_rest_shape():
     history = bent(SQUEEZED)
     empty = history.select_rows(torch.zeros(300, dtype=torch.bool))
     assert make_dynamics(ELASTIC)(empty).n_rows == 0
     assert residual(dataclasses.replace(history, rest_positions=None)).abs().max() < 1e-6
 
 
-def test_a_place_that_is_none_spoils_nothing():
+def test_invalid_position_changes_no_other_particle():
     history = bent(SQUEEZED)
     means, others = history.means.clone(), torch.arange(300) != 7
     means[7] = torch.nan
@@ -119,14 +120,60 @@ def test_a_place_that_is_none_spoils_nothing():
     assert_close_relative_to_max(way[others], residual(history)[others], 0.05)
 
 
-def test_simulated_rows_remember_where_they_were():
+def test_rollout_keeps_rest_positions():
     dynamics, history = make_dynamics(ELASTIC), make_history((60, 60))
     steps = rollout(dynamics, history, 3, max_steps=2)
     for step in steps:
         assert_same_bits(step.rest_positions, last_steps(history, 1).means)
 
 
-def test_compiled_it_is_the_same(device):
+@pytest.mark.parametrize("background", ["asymmetric", "relightable"])
+def test_shape_matching_for_every_background(background):
+    config = dataclasses.replace(ELASTIC, norm="layer", background=background, zero_init=True)
+    history = bent(SQUEEZED, frozen_share=0.3)
+    moved = make_dynamics(config)(history).means - history.means
+    assert_close_relative_to_max(moved, BACK * residual(history), 1e-3)
+
+
+def test_gain_adds_to_stiffness():
+    history = bent(SQUEEZED)
+    dynamics = make_dynamics(dataclasses.replace(ELASTIC, zero_init=True))
+    dynamics.priors.get("shape_matching").gain_head.bias.detach()[:] = 2 * torch.tensor(0.1).atanh()
+    moved = dynamics(history).means - history.means
+    assert_close_relative_to_max(moved, (0.2 + BACK) * residual(history), 1e-3)
+
+
+def test_untrained_rollout_restores_shape():
+    config = with_priors(TINY, MATCHING, zero_init=True)
+    history = bent(SQUEEZED)
+    step = make_dynamics(config)(history)
+    assert_close_relative_to_max(step.means - history.means, BACK * residual(history), 1e-3)
+    end = rollout(make_dynamics(config), history, 12, max_steps=1)[-1]
+    assert residual(end).abs().max() < 0.05 * residual(history).abs().max()
+
+
+def test_network_reads_features():
+    """Without the columns that read it the next step is another one."""
+    dynamics, history = make_dynamics(ELASTIC), bent(SQUEEZED)
+    torch.nn.init.normal_(dynamics.priors.get("shape_matching").in_proj.weight)
+    step = dynamics(history)
+    with torch.no_grad():
+        dynamics.priors.get("shape_matching").in_proj.weight[:] = 0
+    assert (dynamics(history).dynamic_latents - step.dynamic_latents).abs().max() > 1e-6
+
+
+@pytest.mark.parametrize("edit", [Move(by=(0.1, 0.0, 0.2)), Rotate(axis=(1.0, 2.0, 0.5), degrees=130)])
+def test_edits_leave_no_residual(edit):
+    history = bent(torch.eye(3))
+    assert residual(edit.apply(history, None)).abs().max() < 1e-5
+
+
+def test_on_gpu(devices):
+    expected, actual = (residual(bent(SQUEEZED).to(device)).cpu() for device in devices)
+    assert_close_relative_to_max(actual, expected, 1e-4)
+
+
+def test_compiled(device):
     history = bent(SQUEEZED).to(device)
     history.clouds
     priors, compiled = build(history, MATCHING), torch.compile(residual, fullgraph=True)

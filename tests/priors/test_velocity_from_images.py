@@ -1,4 +1,4 @@
-"""How encoded matter moves, found in images."""
+"""Velocities of encoded particles, found in images."""
 
 import dataclasses
 
@@ -95,7 +95,7 @@ def motion_of(particles, found):
 
 @pytest.mark.parametrize("spin", [SPIN, (0.0, 0.0, 0.04), (0.0, 0.0, 0.0)])
 @pytest.mark.parametrize("lit", [False, True])
-def test_it_finds_how_a_body_flies_and_turns_whatever_the_light_does(spin, lit):
+def test_velocity_and_spin_under_any_light(spin, lit):
     particles, frames = filmed(spin=spin, lit=lit)
     velocity, turn = motion_of(particles, follow(particles, frames))
     assert (velocity - torch.tensor(VELOCITY)).norm() < 1e-3
@@ -103,7 +103,7 @@ def test_it_finds_how_a_body_flies_and_turns_whatever_the_light_does(spin, lit):
 
 
 @pytest.mark.parametrize("spin", [(0.0, 0.0, 0.3), (0.25, -0.1, 0.1)])
-def test_it_finds_how_a_body_tumbles(spin):
+def test_velocity_of_tumbling_body(spin):
     """Since the oldest step by 0.9 rad: more than is found again without the spin of the last step."""
     particles, frames = filmed(spin=spin)
     particles = dataclasses.replace(particles, body=torch.ones_like(particles.means))
@@ -114,7 +114,7 @@ def test_it_finds_how_a_body_tumbles(spin):
     assert off.max() < 0.05 * RADIUS * torch.tensor(spin).norm()
 
 
-def test_places_that_are_wrong_do_not_matter_much():
+def test_noisy_positions():
     """Those of encoded rows are, by about a centimetre."""
     particles, frames = filmed()
     noise = 0.01 * torch.randn(particles.means.shape, generator=torch.Generator().manual_seed(1))
@@ -124,7 +124,7 @@ def test_places_that_are_wrong_do_not_matter_much():
     assert (turn - torch.tensor(SPIN)).norm() < 8e-3
 
 
-def test_only_movable_rows_of_the_newest_cloud_have_one():
+def test_only_movable_particles_of_newest_cloud():
     particles, frames = filmed()
     activity = particles.activity.clone()
     activity[-500:] = FROZEN
@@ -135,7 +135,7 @@ def test_only_movable_rows_of_the_newest_cloud_have_one():
 
 
 @pytest.mark.parametrize("n_steps", [2, 4])
-def test_what_falls_is_faster_in_its_last_step_than_on_average(n_steps):
+def test_gravity_gives_velocity_of_last_step(n_steps):
     """By half of gravity for every step but one between the oldest and the newest."""
     particles, frames = filmed(n_steps=n_steps)
     gravity = torch.tensor([0.001, 0.0, -0.004])
@@ -148,12 +148,12 @@ def test_what_falls_is_faster_in_its_last_step_than_on_average(n_steps):
     assert not last[~moves].any()
 
 
-def test_one_step_tells_nothing():
+def test_one_step_has_no_velocity():
     particles, frames = filmed(n_steps=1)
     assert not follow(particles, frames).any()
 
 
-def test_clouds_older_than_a_history_are_not_looked_at():
+def test_older_clouds_are_ignored():
     particles, frames = filmed()
     velocity = 0.01 * torch.rand(3)
     moved = torch.where((particles.row_cloud() == 0)[:, None], particles.means + 20 * velocity, particles.means)
@@ -166,7 +166,7 @@ def test_clouds_older_than_a_history_are_not_looked_at():
     assert (velocity - torch.tensor(VELOCITY)).norm() < 1e-3 and (turn - torch.tensor(SPIN)).norm() < 8e-3
 
 
-def test_far_from_the_origin_it_is_the_same():
+def test_far_from_origin():
     particles, frames = filmed()
     far = torch.tensor([300.0, -200.0, 100.0])
     viewmats = frames.cameras.viewmats.clone()
@@ -177,7 +177,7 @@ def test_far_from_the_origin_it_is_the_same():
     assert_close_relative_to_max(found, follow(particles, frames), 0.03)
 
 
-def test_images_may_come_in_any_order_of_clouds_and_be_counted_beforehand():
+def test_any_order_of_images():
     particles, frames = filmed()
     expected = follow(particles, frames)
     assert_same_bits(follow(particles, frames, n_views=4), expected)
@@ -188,7 +188,7 @@ def test_images_may_come_in_any_order_of_clouds_and_be_counted_beforehand():
     assert_same_bits(follow(particles, mixed), expected)
 
 
-def test_clouds_with_fewer_views_are_compared_in_those():
+def test_fewer_views():
     particles, frames = filmed()
     kept = torch.arange(2, 16)
     fewer = dataclasses.replace(
@@ -198,7 +198,7 @@ def test_clouds_with_fewer_views_are_compared_in_those():
     assert (velocity - torch.tensor(VELOCITY)).norm() < 3e-3 and turn.isfinite().all()
 
 
-def test_scenes_do_not_see_each_other():
+def test_batch_equals_single_scenes():
     one, other = filmed(), filmed(velocity=(0.0, 0.01, 0.0), spin=(0.0, 0.03, 0.0), seed=1)
     particles = batch([one[0], other[0]])
     image_cloud = torch.cat([one[1].cameras.image_cloud, other[1].cameras.image_cloud + 4])
@@ -212,14 +212,14 @@ def test_scenes_do_not_see_each_other():
     assert_close_relative_to_max(together, alone, 1e-4)
 
 
-def test_images_that_show_nothing_leave_the_way_of_the_means():
+def test_blank_images_leave_displacement_of_means():
     particles, frames = filmed(spin=(0.0, 0.0, 0.0))
     dark = dataclasses.replace(frames, images=torch.zeros_like(frames.images))
     velocity, turn = motion_of(particles, follow(particles, dark))
     assert (velocity - torch.tensor(VELOCITY)).norm() < 1e-4 and turn.norm() < 1e-4
 
 
-def test_a_gpu_finds_the_same(devices):
+def test_on_gpu(devices):
     particles, frames = filmed()
     expected, actual = (follow(particles.to(d), frames.to(d)).cpu() for d in devices)
     assert_close_relative_to_max(actual, expected, 1e-3)
