@@ -376,3 +376,18 @@ def test_committed_states_are_read_and_load(tmp_path, capsys):
     moments = [trainer.optimizer.state[parameter].get("exp_avg_sq") for parameter in trainer.parameters.values()]
     assert sum(value is not None and bool(value.any()) for value in moments) > 0.9 * len(moments)
     assert sum(not torch.equal(before[key], value) for key, value in trainer.parameters.items()) > 0.9 * len(before)
+
+
+def test_new_priors_begin_at_their_first_values(first_run, store, tmp_path):
+    trainer, state, _ = first_run
+    priors = [{"type": "position_waves", "count": 2}]
+    config = dataclasses.replace(CONFIG, model={"dynamics": {"priors": priors}})
+    other = RunTrainer(config, store, tmp_path / "other", "cpu")
+    first = {name: value.clone() for name, value in other.simulator.state_dict().items()}
+    assert load_into(other, state, NAME).step == 3
+    assert other.new_parameters and all(
+        name.startswith("dynamics.priors.position_waves.") for name in other.new_parameters
+    )
+    for name, value in other.simulator.state_dict().items():
+        known = first[name] if name in other.new_parameters else trainer.simulator.state_dict()[name]
+        assert torch.allclose(value, known, atol=known.abs().max().item() / 100), name

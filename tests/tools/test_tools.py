@@ -112,10 +112,10 @@ def test_padding_particles_of_benchmark_stay(masked, bench):
         counts = frames.masks.reshape(2, -1).sum(1).tolist()
         places = scene.frames(1, [scene.evenly(2)] * 2, 32, False)[1][frames.masks.flatten()]
         assert counts[0] < counts[1]
-    room = simulator.encoder.room(frames, max(counts) + 5)
+    shapes = simulator.encoder.static_shapes(frames, max(counts) + 5)
     with torch.no_grad():
-        before = simulator.encode(frames, room=room)
-        state = scene.as_if_trained(simulator, places).encode(frames, room=room)
+        before = simulator.encode(frames, shapes=shapes)
+        state = scene.as_if_trained(simulator, places).encode(frames, shapes=shapes)
     for q, (begin, end) in enumerate(state.cu_rows.unfold(0, 2, 1).tolist()):
         middle = begin + counts[q]
         assert end - begin == max(counts) + 5

@@ -14,7 +14,7 @@ from gsim3d.errors import InputError, NumericalError
 from gsim3d.train.loop import deterministic
 from gsim3d.train.processes import Processes, joined
 from gsim3d.train.restore import build_simulator, model_config
-from tests.train.test_release_state import CONFIG, NAME, Painted
+from tests.tools.test_release_state import CONFIG, NAME, Painted
 from tests.two_processes import run_in_two_processes
 from tools.release import runs
 from tools.release.runs import RunTrainer, train
