@@ -8,8 +8,8 @@ from __future__ import annotations
 import ast
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "gsim3d"
@@ -17,8 +17,7 @@ LIBRARY = ("ops", "nn", "dynamics", "priors", "effects", "numerics", "math", "pr
 FORMATS = ("io", "viewer")
 
 
-@dataclass(frozen=True)
-class Size:
+class Size(NamedTuple):
     """One size and its limit.
 
     Attributes:

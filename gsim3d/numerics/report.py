@@ -150,7 +150,7 @@ class StabilityReport:
     def clear(self) -> None:
         """Forgets everything."""
         self._found: dict[tuple, Finding] = {}
-        self._total, self._raised = 0, 0
+        self._total = 0
         self._errors: list[Finding] = []
         self._first_error: Finding | None = None
         self._statistics: dict[tuple[int, int], Statistics] = {}

@@ -20,7 +20,7 @@ from torch import Tensor
 from gsim3d.cameras import Cameras, Frames
 from gsim3d.dynamics import last_steps
 from gsim3d.effects.plan import Plan
-from gsim3d.math.rotations import rotate_left, rotation_matrices
+from gsim3d.math.rotations import quat_product, rotation_matrices, rotation_to_quat
 from gsim3d.math.spherical_harmonics import rotate_harmonics
 from gsim3d.nn.gaussian_head import render
 from gsim3d.simulator import Simulator
@@ -194,25 +194,14 @@ def move_cameras(cameras: Cameras, rotation: Tensor, translation: Tensor) -> Cam
 
 def move_gaussians(gaussians: Gaussians, rotation: Tensor, translation: Tensor) -> Gaussians:
     """Gaussians of a world moved by ``x -> rotation x + translation``: positions, rotations and harmonics."""
-    vector = rotation_vector(rotation).to(gaussians.quats)
+    quat = rotation_to_quat(rotation[None]).to(gaussians.quats)
     matrices = rotation.to(gaussians.sh).expand(gaussians.sh.shape[0], 3, 3)
     return dataclasses.replace(
         gaussians,
         means=(gaussians.means.double() @ rotation.T + translation).to(gaussians.means),
-        quats=rotate_left(gaussians.quats, vector.expand(gaussians.quats.shape[0], 3)),
+        quats=quat_product(quat.expand_as(gaussians.quats), gaussians.quats),
         sh=rotate_harmonics(gaussians.sh, matrices),
     )
-
-
-def rotation_vector(rotation: Tensor) -> Tensor:
-    """[3] axis times angle in radians of a rotation [3, 3] by less than half a turn."""
-    axis = torch.stack(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
-    )
-    sine = axis.norm() / 2
-    if float(sine) < 1e-12:
-        return torch.zeros_like(axis)
-    return axis / (2 * sine) * torch.atan2(sine, (rotation.diagonal().sum() - 1) / 2)
 
 
 def random_motion(seed: int, like: Tensor) -> tuple[Tensor, Tensor]:
