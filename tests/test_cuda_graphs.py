@@ -71,7 +71,7 @@ def rolled_out(simulator, state, n_steps, plan=None):
 @pytest.mark.parametrize(
     "n_steps, changes", [(1, {}), (5, {}), (3, {"steps_per_call": 2}), (5, {"background": "relightable"})]
 )
-def test_a_graph_repeats_the_rollout_with_other_particles(n_steps, changes, device):
+def test_graph_repeats_the_rollout_with_other_particles(n_steps, changes, device):
     simulator = make_simulator(device, dynamics=dataclasses.replace(CONFIG.dynamics, **changes))
     captured = CapturedRollout(simulator, make_state(device=device), n_steps, factor=5)
     first = captured(make_state(device=device))
@@ -86,7 +86,7 @@ def test_a_graph_repeats_the_rollout_with_other_particles(n_steps, changes, devi
             assert_same_bits(getattr(step, name), value, name)
 
 
-def test_a_graph_makes_room_where_more_rows_may_move(device):
+def test_graph_grows_when_more_particles_move(device):
     priors = ProximityConfig(range=0.1), InertiaConfig(radius=0.2), ShapeMatchingConfig(radius=0.2)
     simulator = make_simulator(device, dynamics=dataclasses.replace(CONFIG.dynamics, priors=priors))
     state = make_state(device=device)
@@ -101,7 +101,7 @@ def test_a_graph_makes_room_where_more_rows_may_move(device):
     assert captured.captures > made
 
 
-def test_a_state_that_is_prepared_knows_how_its_background_began(device):
+def test_prepared_state_holds_initial_latents(device):
     """Guards compare a step with the one before it, field by field."""
     state = make_state(device=device)
     symmetric, relit = (
@@ -118,7 +118,7 @@ def test_a_state_that_is_prepared_knows_how_its_background_began(device):
     assert_same_bits(again.initial_latents, step.initial_latents)
 
 
-def test_a_graph_counts_steps_from_those_given(device):
+def test_graph_counts_steps_from_those_given(device):
     simulator = make_simulator(device)
     state = make_state(device=device)
     captured = CapturedRollout(simulator, state, 2)
@@ -129,7 +129,7 @@ def test_a_graph_counts_steps_from_those_given(device):
 
 
 @pytest.mark.parametrize("effects", [{"background": "masked_out"}, {"background": "dynamic"}, {"history": 1}])
-def test_a_graph_of_any_plan(effects, device):
+def test_graph_of_any_plan(effects, device):
     simulator, state = make_simulator(device), make_state(device=device)
     plan = simulator.plan(EffectsSpec(dynamics=DynamicsEffects(**effects)))
     captured = CapturedRollout(simulator, state, 3, plan)
@@ -137,7 +137,7 @@ def test_a_graph_of_any_plan(effects, device):
     assert_same_steps(captured(moved).steps, rolled_out(simulator, moved, 3, plan))
 
 
-def test_a_graph_renders_every_step(device):
+def test_graph_renders_every_step(device):
     simulator, state, background = make_simulator(device), make_state(device=device), torch.tensor([0.1, 0.5, 0.9])
     background = background.to(device, default_dtype(device))
     captured = CapturedRollout(simulator, state, 2, cameras=make_cameras(device=device), background=background)
@@ -154,7 +154,7 @@ def test_a_graph_renders_every_step(device):
     assert_same_bits(captured(state).renderings[1].color, rendering.color)
 
 
-def test_a_graph_without_room_is_captured_again(device):
+def test_graph_is_captured_again_with_more_capacity(device):
     simulator, state = make_simulator(device), make_state(device=device)
     small = dataclasses.replace(state, means=0.5 + 0.02 * state.means)
     captured = CapturedRollout(simulator, small, 3)
@@ -168,7 +168,7 @@ def test_a_graph_without_room_is_captured_again(device):
     assert captured.captures == grown
 
 
-def test_a_graph_can_be_launched_without_waiting(device):
+def test_graph_can_be_launched_without_waiting(device):
     simulator, state = make_simulator(device), make_state(device=device)
     captured = CapturedRollout(simulator, state, 2, copies=False)
     other = make_state(3, device)
@@ -179,7 +179,7 @@ def test_a_graph_can_be_launched_without_waiting(device):
         captured.finish()
 
 
-def test_a_graph_tells_the_report(device):
+def test_graph_fills_the_report(device):
     simulator = make_simulator(device, stability=StabilityConfig(on_invalid="drop"))
     state, report = make_state(device=device), StabilityReport()
     captured = CapturedRollout(simulator, state, 2, report=report)
@@ -230,7 +230,7 @@ def test_graph_under_autocast_reads_reloaded_weights(dtype, devices):
     assert not torch.equal(anew(state).steps[1].dynamic_latents, before[1].dynamic_latents)
 
 
-def test_a_graph_of_gradients(devices):
+def test_graph_of_gradients(devices):
     simulator = make_simulator(devices[1]).train()
     history = make_state(device=devices[1])
     history = history.with_clouds(history.clouds)
@@ -261,7 +261,7 @@ def float32_training(device):
     return dynamics, history, PyramidCapacity.of(dynamics.geometry(history), history.n_rows, 2)
 
 
-def test_a_graph_of_gradients_rounds_weights_that_have_changed(devices):
+def test_graph_of_gradients_rounds_weights_that_have_changed(devices):
     dynamics, history, capacity = float32_training(devices[1])
     parameters = list(dynamics.parameters())
 
@@ -279,7 +279,7 @@ def test_a_graph_of_gradients_rounds_weights_that_have_changed(devices):
                 parameter.mul_(1.2)
 
 
-def test_a_graph_of_gradients_inside_an_autocast_that_has_rounded_weights(devices):
+def test_graph_of_gradients_inside_an_autocast_that_has_rounded_weights(devices):
     dynamics, history, capacity = float32_training(devices[1])
     parameters = list(dynamics.parameters())
 
@@ -294,7 +294,7 @@ def test_a_graph_of_gradients_inside_an_autocast_that_has_rounded_weights(device
         assert_same_bits(actual, wanted)
 
 
-def test_what_waits_for_the_device_is_no_graph(devices):
+def test_waiting_for_the_device_cannot_be_captured(devices):
     x = torch.ones(3, device=devices[1])
     with pytest.raises(CaptureError, match="Captured: .*captur") as caught:
         Captured(lambda: x.sum().item(), devices[1])
@@ -303,7 +303,7 @@ def test_what_waits_for_the_device_is_no_graph(devices):
     assert Captured(lambda: 2 * x, devices[1])().tolist() == [2, 2, 2]
 
 
-def test_what_a_gpu_is_out_of_memory_for(devices):
+def test_gpu_out_of_memory_is_reported(devices):
     with pytest.raises(CaptureError, match="out of memory") as caught:
         Captured(lambda: torch.empty(1 << 50, dtype=torch.uint8, device=devices[1]), devices[1])
     assert caught.value.out_of_memory
@@ -316,7 +316,7 @@ def test_what_a_gpu_is_out_of_memory_for(devices):
     assert caught.value.out_of_memory
 
 
-def test_an_op_without_room_says_so_in_its_own_words():
+def test_op_out_of_memory_raises_its_own_message():
     with pytest.raises(RuntimeError) as caught:
         torch.ops.gsim3d.unpool(torch.ones(1, 1), torch.tensor([0]), torch.tensor([0, 1]), 2**62)
     assert is_out_of_memory(caught.value) and not is_out_of_memory(RuntimeError("another"))
@@ -343,7 +343,7 @@ def test_collected_graphs_do_not_end_a_capture(devices):
 
 
 @pytest.mark.parametrize("enabled", [True, False])
-def test_the_collector_goes_on_as_before(enabled):
+def test_collector_goes_on_as_before(enabled):
     assert gc.isenabled()
     try:
         (gc.enable if enabled else gc.disable)()
@@ -355,7 +355,7 @@ def test_the_collector_goes_on_as_before(enabled):
         gc.enable()
 
 
-def test_only_a_gpu_has_graphs():
+def test_captured_needs_a_gpu():
     with pytest.raises(CaptureError, match="device must be a GPU; got cpu"):
         Captured(lambda: None, "cpu")
 
@@ -388,7 +388,7 @@ def test_compile_of_a_rollout(device):
     assert_close_relative_to_max(latents, expected.dynamic_latents, "dynamics_order")
 
 
-def test_a_graph_keeps_the_constants_it_reads(devices):
+def test_graph_keeps_the_constants_it_reads(devices):
     simulator, state = make_simulator(devices[1]), make_state(device=devices[1])
     captured = CapturedRollout(simulator, state, 2)
     expected = captured(state).steps

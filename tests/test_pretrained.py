@@ -29,7 +29,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_a_name_is_the_simulator_and_a_path_the_file(folder, monkeypatch):
+def test_name_is_the_simulator_and_a_path_the_file(folder, monkeypatch):
     (folder / "ball-tiny").mkdir()
     assert pretrained.names() == []
     (folder / "ball-tiny" / pretrained.WEIGHTS).write_bytes(b"")
@@ -41,7 +41,7 @@ def test_a_name_is_the_simulator_and_a_path_the_file(folder, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["ball-tiny", "ball-tiny/model.safetensors", "../ball-tiny", ""])
-def test_an_unknown_name_lists_the_known_ones(folder, name):
+def test_unknown_name_lists_the_known_ones(folder, name):
     (folder / "cube-tiny").mkdir()
     (folder / "cube-tiny" / pretrained.WEIGHTS).write_bytes(b"")
     if name:
@@ -60,14 +60,14 @@ def test_an_unknown_name_lists_the_known_ones(folder, name):
         ["doctor", "--stability", "ball-small"],
     ],
 )
-def test_commands_name_what_they_do_not_know(command, capsys, tmp_path, monkeypatch):
+def test_commands_name_unknown_models(command, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(command) == 2
     assert "ball-small: no such" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", pretrained.names())
-def test_what_is_shipped_is_whole_and_described(name):
+def test_shipped_models_are_complete_and_described(name):
     folder = pretrained.FOLDER / name
     assert {path.name for path in folder.iterdir()} - {pretrained.LAWS} == {*PARTS, SPEEDS_FILE}
     weights = load_file(folder / pretrained.WEIGHTS)
@@ -104,6 +104,6 @@ def test_other_checkpoints_have_no_known_failures(folder):
     assert pretrained.known_failures(folder / "elsewhere" / "run" / pretrained.WEIGHTS) == {}
 
 
-def test_all_that_is_shipped_is_small():
+def test_shipped_files_are_small():
     sizes = [(pretrained.FOLDER / name / pretrained.WEIGHTS).stat().st_size for name in pretrained.names()]
     assert sum(sizes) <= MOST_BYTES

@@ -95,7 +95,7 @@ def test_encode_step_rollout_render():
     assert image.color.shape == (3, SIZE, SIZE, 3) and torch.isfinite(image.color).all() and image.alpha.max() > 0.05
 
 
-def test_encoded_particles_know_how_fast_they_are_and_what_stands_in_their_light():
+def test_encoded_particles_have_velocity_and_light_occlusion():
     """Velocities come from no step that is older than the longest history, here of four."""
     priors = VelocityFromImagesConfig(radius=0.5), InertiaConfig(radius=0.5), OCCLUSION
     seeing = dataclasses.replace(CONFIG.dynamics, priors=priors)
@@ -118,7 +118,7 @@ def test_encoded_particles_know_how_fast_they_are_and_what_stands_in_their_light
     assert not torch.equal(in_history.velocity, too_old.velocity)
 
 
-def test_with_gravity_encoded_particles_in_flight_are_as_fast_as_in_their_last_step():
+def test_gravity_sets_encoded_velocity_in_flight_to_last_step():
     """Not as on average over the three steps that were given; those that touch something are."""
     fall = (0.0, 0.002, -0.01)
     priors = VelocityFromImagesConfig(radius=0.1), ProximityConfig(range=0.05), InertiaConfig(radius=0.1)
@@ -138,7 +138,7 @@ def test_with_gravity_encoded_particles_in_flight_are_as_fast_as_in_their_last_s
 
 @pytest.mark.parametrize("name", ["means", "dynamic_latents"])
 @pytest.mark.parametrize("activity", [DYNAMIC, FROZEN])
-def test_what_a_broken_row_remembers_is_not_used(name, activity):
+def test_memory_of_broken_rows_is_not_used(name, activity):
     priors = InertiaConfig(radius=0.5), ShapeMatchingConfig(radius=0.5), OCCLUSION
     dynamics = dataclasses.replace(CONFIG.dynamics, priors=priors, background="relightable")
     config = dataclasses.replace(CONFIG, dynamics=dynamics)
@@ -199,7 +199,7 @@ def test_published_behaviour_end_to_end():
     assert not [name for name in missing if "time_embedding" not in name], missing
 
 
-def test_the_published_renderer_draws_each_camera_s_cloud():
+def test_released_renderer_draws_cloud_of_each_camera():
     simulator, frames = published_simulator(), make_frames((2, 1))
     particles = simulator.encode(frames)
     cameras, background = frames.cameras, torch.rand(len(frames.cameras), 3)
@@ -341,7 +341,7 @@ def test_background_frozen_masked_out_and_dynamic():
 
 
 @pytest.mark.parametrize("changing", ["all", "dynamic", "none"])
-def test_whose_features_change(changing):
+def test_changing_features_by_selection(changing):
     simulator, frames = make_simulator(), make_frames((2,))
     state = simulator.encode(frames)
     newest = last_steps(state, 1)
@@ -423,14 +423,14 @@ def test_cuda_equals_cpu(devices):
     )
 
 
-def test_a_rollout_and_its_gradients_repeat_bit_by_bit(device):
+def test_rollout_and_its_gradients_repeat_bit_by_bit(device):
     with deterministic():
         runs = [images_and_gradients(device, torch.float32) for _ in range(2)]
     for i, (a, b) in enumerate(zip(*runs, strict=True)):
         assert_same_bits(a, b, f"output {i}")
 
 
-def test_a_gpu_that_is_not_the_current_one_gives_the_same_bits(gpus):
+def test_gpu_that_is_not_the_current_one_gives_the_same_bits(gpus):
     with deterministic():
         first, second = (images_and_gradients(gpu, torch.float32) for gpu in gpus)
     assert second[0].device == gpus[1] and torch.cuda.current_device() == 0

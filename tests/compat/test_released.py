@@ -46,7 +46,7 @@ def test_presets_have_the_published_names_and_shapes(file, preset, arguments, en
 
 
 @pytest.mark.golden
-def test_the_full_model_is_the_released_one():
+def test_full_model_is_the_released_one():
     listed = json.loads(golden_path("params_full.json").read_text())["full_latent_4_1_12_intended"]
     published = {entry["name"]: tuple(entry["shape"]) for entry in listed["entries"]}
     shapes = published_shapes(full_config("paper_latent", 4, 64))
@@ -54,7 +54,7 @@ def test_the_full_model_is_the_released_one():
     assert n_parameters(shapes) == listed["param_count_total"]
 
 
-def test_the_length_of_history_changes_no_parameter():
+def test_length_of_history_changes_no_parameter():
     shapes = [published_shapes(presets.paper_latent(n)) for n in (1, 2, 4, 8)]
     assert all(other == shapes[0] for other in shapes)
     with pytest.raises(ValueError, match="1, 2, 4 or 8"):
@@ -69,7 +69,7 @@ def test_small_has_about_four_million_parameters():
 
 @pytest.mark.parametrize("steps_per_call", [1, 2])
 @pytest.mark.parametrize(("explicit", "dynamic", "static"), [(False, 4, 3), (False, 4, 0), (True, 0, 2), (True, 0, 0)])
-def test_there_and_back(explicit, dynamic, static, steps_per_call):
+def test_weights_round_trip(explicit, dynamic, static, steps_per_call):
     config = small_config(explicit, dynamic, static, steps_per_call=steps_per_call)
     published = random_weights(config)
     ours = from_published(published, config)
@@ -121,7 +121,7 @@ def test_explicit_dynamics_say_the_same_in_either_basis():
         assert torch.equal(mine[:, first + 48 : first + 58], theirs[:, first + 48 : first + 58])
 
 
-def test_the_published_head_has_no_bias_in_its_last_layer():
+def test_published_head_has_no_bias_in_its_last_layer():
     config = small_config()
     weights = from_published(random_weights(config), config)
     weights["renderer.fc2.bias"] = torch.ones_like(weights["renderer.fc2.bias"])

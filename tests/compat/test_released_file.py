@@ -44,14 +44,14 @@ def test_every_kind_of_tensor_is_read_as_it_was(tmp_path):
             assert stored[name].shape == tuple(value.shape)
 
 
-def test_a_bare_state_dict_is_a_checkpoint_too(tmp_path):
+def test_bare_state_dict_is_a_checkpoint_too(tmp_path):
     path = write(tmp_path / "a.ckpt", torch.nn.Linear(2, 3).state_dict())
     with ReleasedFile(path) as file:
         stored, counts = state_dict(file)
     assert {name: tensor.shape for name, tensor in stored.items()} == {"weight": (3, 2), "bias": (3,)} and not counts
 
 
-def test_what_training_tools_leave_is_passed_over(tmp_path, monkeypatch):
+def test_objects_of_training_tools_are_ignored(tmp_path, monkeypatch):
     module = types.ModuleType("omegaconf.dictconfig")
     module.DictConfig = type("DictConfig", (), {"__module__": "omegaconf.dictconfig"})
     monkeypatch.setitem(sys.modules, "omegaconf", types.ModuleType("omegaconf"))
@@ -87,7 +87,7 @@ class Calls:
     [(os.system, "system"), (exec, "builtins.exec"), (eval, "builtins.eval"), (getattr, "builtins.getattr"),
      (torch.load, "torch.serialization.load"), (pickle.loads, "loads"), (open, "open")],
 )  # fmt: skip
-def test_a_file_that_could_run_code_is_refused(tmp_path, function, name, place):
+def test_file_that_could_run_code_is_refused(tmp_path, function, name, place):
     evil = Calls(function, f"open({str(tmp_path / 'run')!r}, 'w')")
     content = {
         "state_dict": {"state_dict": {"w": torch.ones(2), "x": evil}},
@@ -134,7 +134,7 @@ def test_broken_files_are_named(tmp_path):
         ReleasedFile(rewrite(example(tmp_path), lambda name, data: b"big" if name.endswith("byteorder") else data))
 
 
-def test_a_flipped_bit_of_the_numbers_is_found(tmp_path):
+def test_flipped_bit_of_the_numbers_is_found(tmp_path):
     path = example(tmp_path)
     content = bytearray(path.read_bytes())
     content[content.find(np.arange(12.0, dtype=np.float32).tobytes()) + 5] ^= 1
@@ -143,7 +143,7 @@ def test_a_flipped_bit_of_the_numbers_is_found(tmp_path):
         file.read(state_dict(file)[0]["w"])
 
 
-def test_a_tensor_larger_than_its_storage_is_refused(tmp_path):
+def test_tensor_larger_than_its_storage_is_refused(tmp_path):
     path = rewrite(example(tmp_path), lambda name, data: data[:-4] if name.endswith("data/0") else data)
     with ReleasedFile(path) as file:
         stored = state_dict(file)[0]["w"]
@@ -156,7 +156,7 @@ def test_a_tensor_larger_than_its_storage_is_refused(tmp_path):
             file.read(StoredTensor("7", stored.dtype, 0, (1,), (1,)))
 
 
-def test_an_index_that_would_fill_the_memory_is_refused(tmp_path):
+def test_index_that_would_fill_the_memory_is_refused(tmp_path):
     huge = pickle.PROTO + b"\x02" + pickle.EMPTY_DICT + pickle.LONG_BINPUT + b"\xff\xff\xff\x7f" + pickle.STOP
     path = rewrite(example(tmp_path), lambda name, data: huge if name.endswith("data.pkl") else data)
     with pytest.raises(InputError, match="memo is out of range"):
@@ -168,6 +168,6 @@ def test_an_index_that_would_fill_the_memory_is_refused(tmp_path):
     [([1, 2], "holds a list"), ({"a": 1}, "holds no weights"), ({"state_dict": 3}, "not a table"),
      ({"state_dict": {1: torch.ones(1)}}, "not a table")],
 )  # fmt: skip
-def test_what_holds_no_weights_is_refused(tmp_path, content, message):
+def test_file_without_weights_is_refused(tmp_path, content, message):
     with ReleasedFile(write(tmp_path / "a.ckpt", content)) as file, pytest.raises(InputError, match=message):
         state_dict(file)

@@ -66,7 +66,7 @@ def offsets(mask):
     return torch.cat([torch.zeros(1, dtype=torch.int64), mask.sum(2).flatten().cumsum(0)])
 
 
-def test_the_whole_model_is_named(import_model):
+def test_whole_model_is_named(import_model):
     simulator, weights = import_model("f_dynamics_small_nodup")
     listed = json.loads(golden_path("params_full.json").read_text())["small"]
     back = to_published(simulator.state_dict(), simulator.config)

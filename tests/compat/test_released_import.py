@@ -91,7 +91,7 @@ def test_tensors_that_do_not_fit_are_named(capsys, tmp_path):
         (lambda w, name: w.update({name: w[name][1:]}), r"configuration; 1 of another shape: {name} is \[11\] instead"),
     ],
 )
-def test_one_tensor_that_does_not_fit_is_enough(tmp_path, change, message):
+def test_single_misfitting_tensor_is_refused(tmp_path, change, message):
     config = small_config()
     weights, name = random_weights(config), "encoder.backbone.backbone.layer2.0.downsample.0.bias"
     change(weights, name)
@@ -289,14 +289,14 @@ def test_bad_input_gets_one_line_and_exit_code_2(capsys, tmp_path, arguments, me
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_a_wrong_setting_is_named_with_its_file(capsys, tmp_path):
+def test_wrong_setting_is_named_with_its_file(capsys, tmp_path):
     config = small_config()
     settings = changed(settings_of(config), "model.encoder.num_surfaces", 2)
     code, _, err = run_import(capsys, *write_release(tmp_path, random_weights(config), settings), tmp_path / "model")
     assert code == 2 and f"{tmp_path / 'model.yaml'}: model.encoder.num_surfaces: 2 is not supported" in err
 
 
-def test_the_imported_model_is_evaluated_at_its_own_size(capsys, tmp_path):
+def test_imported_model_is_evaluated_at_its_own_size(capsys, tmp_path):
     """Films of twice the size, with depth bounds of their own, are fitted to what the model was trained on."""
     config = small_config()
     settings = changed(settings_of(config), "dataset.view_sampler.num_context_views", 2)
@@ -310,7 +310,7 @@ def test_the_imported_model_is_evaluated_at_its_own_size(capsys, tmp_path):
     assert isinstance(metrics["future.psnr"], float)
 
 
-def test_the_file_that_is_wrong_is_named_however_it_was_written(capsys, tmp_path, monkeypatch):
+def test_wrong_file_is_named(capsys, tmp_path, monkeypatch):
     config = small_config()
     write_release(tmp_path, {"a": torch.ones(1)}, settings_of(config))
     monkeypatch.chdir(tmp_path)
@@ -320,7 +320,7 @@ def test_the_file_that_is_wrong_is_named_however_it_was_written(capsys, tmp_path
     )
 
 
-def test_what_was_found_is_kept_with_the_weights(tmp_path):
+def test_findings_are_saved_with_the_weights(tmp_path):
     config = small_config()
     weights = random_weights(config)
     files = write_release(tmp_path, weights, changed(settings_of(config), "dataset.speedup", 2))

@@ -90,7 +90,7 @@ def test_harmonics_turn(degree):
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
-def test_an_exact_rotation_differs_near_turns_about_y_only(degree):
+def test_exact_rotation_differs_near_turns_about_y_only(degree):
     """Rows 0 and 1, the identity and a turn about y, are where the published angles are clamped."""
     g = golden("j_sh_rotation")
     sh, expected = g[f"deg{degree}/sh"].double().mT, g[f"f64/deg{degree}/out_float64"]

@@ -48,7 +48,7 @@ def test_spec(tmp_path):
             assert all(torch.equal(value, getattr(before, name)[key]) for key, value in getattr(after, name).items())
 
 
-def test_the_pointer_names_the_newest_and_old_ones_go(tmp_path):
+def test_pointer_names_the_newest_and_old_ones_go(tmp_path):
     for step in (5, 10, 15):
         checkpoint.save(tmp_path, example(step), keep=2)
     assert (tmp_path / "checkpoints" / "last").read_text() == "step_000015"
@@ -57,7 +57,7 @@ def test_the_pointer_names_the_newest_and_old_ones_go(tmp_path):
     assert not checkpoint.exists(tmp_path / "other") and checkpoint.exists(tmp_path)
 
 
-def test_a_kill_while_writing_leaves_the_last_one_good(tmp_path):
+def test_kill_while_writing_leaves_the_last_one_good(tmp_path):
     checkpoint.save(tmp_path, example(5))
     script = (
         "import os, signal\n"
@@ -74,7 +74,7 @@ def test_a_kill_while_writing_leaves_the_last_one_good(tmp_path):
 
 
 @pytest.mark.parametrize("file", ["model.safetensors", "ema.safetensors", "optimizer.safetensors", "config.yaml"])
-def test_a_truncated_changed_or_missing_file_is_named(tmp_path, file):
+def test_truncated_changed_or_missing_file_is_named(tmp_path, file):
     folder = checkpoint.save(tmp_path, example())
     content = (folder / file).read_bytes()
     for broken in (content[:-3], content[:-1] + bytes([content[-1] ^ 1]), None):
@@ -87,7 +87,7 @@ def test_a_truncated_changed_or_missing_file_is_named(tmp_path, file):
     checkpoint.load(tmp_path)
 
 
-def test_a_broken_one_names_the_newest_that_is_whole(tmp_path):
+def test_broken_checkpoint_names_newest_whole_one(tmp_path):
     for step in (5, 10, 15):
         checkpoint.save(tmp_path, example(step), keep=3)
     for step in (10, 15):
@@ -125,7 +125,7 @@ def test_full_disk_raises_and_keeps_last_checkpoint(tmp_path, room):
     assert checkpoint.load(tmp_path).state["step"] == 10
 
 
-def test_what_is_not_a_checkpoint_is_refused(tmp_path):
+def test_other_files_are_refused(tmp_path):
     with pytest.raises(InputError, match="no such checkpoint"):
         checkpoint.load(tmp_path / "missing")
     with pytest.raises(InputError, match="not a checkpoint"):
@@ -146,7 +146,7 @@ def write_state(folder, state):
 
 
 @pytest.mark.parametrize("key, value", [("step", 4), ("n_skipped", 3), ("loss_scale", [1.0, 3]), ("scenes", ["b"])])
-def test_a_changed_state_is_refused(tmp_path, key, value):
+def test_changed_state_is_refused(tmp_path, key, value):
     folder = checkpoint.save(tmp_path, example())
     state = json.loads((folder / "state.json").read_text())
     (folder / "state.json").write_text(json.dumps({**state, key: value}))
@@ -154,7 +154,7 @@ def test_a_changed_state_is_refused(tmp_path, key, value):
         checkpoint.load(folder)
 
 
-def test_a_state_without_its_own_hash_is_one_of_an_earlier_version(tmp_path):
+def test_state_without_its_own_hash_is_one_of_an_earlier_version(tmp_path):
     folder = checkpoint.save(tmp_path, example())
     state = json.loads((folder / "state.json").read_text())
     del state[checkpoint.OWN_HASH]
@@ -197,7 +197,7 @@ def single(path, config=None, state=None):
         {"config": "1" + "0" * 5000},
     ],
 )  # fmt: skip
-def test_a_single_file_with_hostile_metadata_is_refused(tmp_path, metadata):
+def test_single_file_with_hostile_metadata_is_refused(tmp_path, metadata):
     assert checkpoint.load(single(tmp_path / "good.safetensors")).state["step"] == 3
     with pytest.raises(InputError, match="m.safetensors: ") as error:
         checkpoint.load(single(tmp_path / "m.safetensors", **metadata))

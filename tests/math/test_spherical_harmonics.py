@@ -42,7 +42,7 @@ def test_turned_colour_in_a_turned_direction_is_the_old_colour(degree):
     assert_close_relative_to_max(after, before, 1e-13)
 
 
-def test_the_identity_and_composition():
+def test_identity_and_composition():
     rotations, others = random_rotations(8), random_rotations(8, seed=5)
     sh = torch.randn(8, 16, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     eye = torch.eye(3, dtype=torch.float64).expand(8, 3, 3)

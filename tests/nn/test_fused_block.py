@@ -65,7 +65,7 @@ def test_equals_the_modules(n_rows, own_conv_input, drop, device):
 
 
 @pytest.mark.parametrize("checkpointing", [False, True])
-def test_no_rows_at_all(checkpointing, device):
+def test_empty_input(checkpointing, device):
     block, stage = block_of(device=device, checkpointing=checkpointing), stage_of(0, device)
     out, *grads = run(block, True, stage, drop=True)
     assert out.shape == (0, CHANNELS) and grads[0].shape == (0, CHANNELS)
@@ -88,7 +88,7 @@ def test_two_runs_have_the_same_bits(device):
         assert_same_bits(a, b)
 
 
-def test_without_gradients_the_same_bits_and_nothing_kept(device):
+def test_no_grad_has_same_bits_and_saves_nothing(device):
     block, stage = block_of(device=device), stage_of(device=device)
     expected = run(block, True, stage)[0]
     g = torch.Generator().manual_seed(1)
@@ -124,7 +124,7 @@ def test_autocast_errs_no_more_than_the_modules(dtype, devices):
         assert error <= 2 * allowed + 1e-3 * truth.abs().max().item(), name
 
 
-def test_the_whole_network_equals_its_modules_on_a_gpu(devices):
+def test_whole_network_equals_its_modules_on_a_gpu(devices):
     history = make_history((60, 50)).to(devices[1])
     torch.manual_seed(0)
     model = Dynamics(dataclasses.replace(TINY, norm="batch")).to(devices[1]).eval()
@@ -145,7 +145,7 @@ def test_the_whole_network_equals_its_modules_on_a_gpu(devices):
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 @pytest.mark.parametrize("norm", ["layer", "batch"])
 @pytest.mark.parametrize("sizes", [(60, 50), (0, 50), (0, 0)])
-def test_the_residual_stream_is_float32_under_autocast(sizes, norm, dtype, device):
+def test_residual_stream_is_float32_under_autocast(sizes, norm, dtype, device):
     """Whatever dtype the layers before the first block compute in."""
     history = make_history(sizes).to(device)
     torch.manual_seed(0)
@@ -181,7 +181,7 @@ def test_blocks_take_rows_in_16_bits(fused, device):
     assert_close_relative_to_max(out, expected, 0.05)
 
 
-def test_what_products_read_is_the_rounded_result(device):
+def test_products_read_the_rounded_result(device):
     block, stage = block_of(torch.float32, device), stage_of(device=device)
     block.fused = True
     x = torch.randn(stage.n_rows, CHANNELS, generator=torch.Generator().manual_seed(1)).to(device)

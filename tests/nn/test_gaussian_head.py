@@ -40,7 +40,7 @@ def test_gaussians_keep_place_and_opacity_and_stay_in_their_limits():
     assert_close_relative_to_max(gaussians.quats.norm(dim=1), torch.ones(50), 1e-6)
 
 
-def test_a_head_without_latents_starts_at_identity_and_initial_scale():
+def test_head_without_latents_starts_at_identity_and_initial_scale():
     particles = make_history((5,))
     zero = dataclasses.replace(particles, dynamic_latents=torch.zeros(5, 4), static_latents=torch.zeros(5, 3))
     head = make_head()
@@ -65,7 +65,7 @@ def test_colours_turn_with_the_particle():
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2])
-def test_what_is_turned_further_is_seen_from_as_far_round(degree):
+def test_rotated_appearance_is_seen_from_rotated_direction(degree):
     """Gaussians and colours of a particle that is turned further are its own, seen from as far round."""
     head, particles = make_head(dtype=torch.float64), make_history((10,), dtype=torch.float64)
     turns = torch.nn.functional.normalize(torch.randn(10, 4, dtype=torch.float64), dim=1)

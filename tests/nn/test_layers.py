@@ -136,7 +136,7 @@ def test_products_follow_autocast_on_cuda_only():
 
 
 @pytest.mark.parametrize("n", [3, 100])
-def test_a_linear_layer_has_the_gradients_of_torchs(n, device):
+def test_linear_layer_has_the_gradients_of_torchs(n, device):
     torch.manual_seed(0)
     layer = RowLinear(24, 7).double().to(device)
     x = rows(n, dtype=torch.float64).to(device).requires_grad_()

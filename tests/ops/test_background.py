@@ -200,7 +200,7 @@ def test_autocast(device):
     assert_same_bits(out, x.bfloat16().to(out.dtype) + field.to(out.dtype)[places])
 
 
-def test_a_row_whose_cell_is_out_of_range_is_copied(devices):
+def test_row_of_cell_out_of_range_is_copied(devices):
     x, field, places, _ = (t.to(devices[1]) for t in rows_and_field(dtype=torch.float32))
     wrong = torch.where(torch.arange(70, device=devices[1]) % 2 == 0, places, 2**40 * places - 1)
     out = add_cells(x, field, wrong)
@@ -209,7 +209,7 @@ def test_a_row_whose_cell_is_out_of_range_is_copied(devices):
 
 
 @pytest.mark.parametrize("far", [lambda i: 9 + i, lambda i: -1 - i, lambda i: 2**31 - 1 + i, lambda i: -(2**62) + i])
-def test_a_row_whose_cell_is_out_of_range_gives_its_gradient_to_none(far, devices):
+def test_row_of_cell_out_of_range_has_no_gradient(far, devices):
     x, field, places, cotangent = (t.to(devices[1]) for t in rows_and_field(700, dtype=torch.float64))
     i = torch.arange(700, device=devices[1])
     actual = gradients(lambda *y: add_cells(*y, torch.where(i % 2 == 0, places, far(i))), [x, field], cotangent)
@@ -292,7 +292,7 @@ def test_rows_without_any_patch(device):
         assert not table.kv_rows.any()
 
 
-def test_a_rows_chain_that_ends_early_has_scene_0(device):
+def test_rows_chain_that_ends_early_has_scene_0(device):
     """A row of a given capacity that is none: its segment is empty, or lies behind the list."""
     rows, cu = torch.tensor([1, 0], device=device), torch.tensor([0, 1, 2, 2, 2], device=device)
     scenes = torch.tensor([6], device=device)

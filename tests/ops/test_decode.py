@@ -135,7 +135,7 @@ def test_compiled_equals_eager():
 
 
 # 7 edges
-def test_no_rows(device):
+def test_empty_rows(device):
     raw, table = inputs(0, device=device)
     assert [t.shape for t in run(lambda raw: decode(raw, table), raw)] == [(0, 4), (0, 3), (0, 16, 3), (0, 55)]
 
@@ -186,7 +186,7 @@ def test_readings_too_large_for_products_raise(place, size):
 
 
 @pytest.mark.parametrize("degree", range(4))
-def test_the_largest_numbers_stay_finite(degree):
+def test_largest_numbers_stay_finite(degree):
     raw = torch.full((3, 55), 1e15, requires_grad=True)
     with torch.no_grad():
         raw[1] *= -1

@@ -34,7 +34,7 @@ CALLS = {
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.int32], ids=str)
 @pytest.mark.parametrize("name", CALLS)
-def test_the_first_argument_is_named(name, dtype):
+def test_first_argument_is_named(name, dtype):
     call, shape = CALLS[name]
     call(random(*shape), lambda x: x)
     for rest in (lambda x: x.to(dtype), lambda x: x):

@@ -41,7 +41,7 @@ def test_shipped_models_draw_as_they_were_trained(name):
     assert "jacobian" in model["renderer"] or read(model) == "clamped"
 
 
-def test_a_run_goes_on_as_it_began():
+def test_run_goes_on_as_it_began():
     simulator, model = make_simulator(), to_dict(CONFIG)
     keep_jacobian(simulator, model)
     assert simulator.config == CONFIG
@@ -50,7 +50,7 @@ def test_a_run_goes_on_as_it_began():
     assert simulator.config.renderer == dataclasses.replace(CONFIG.renderer, jacobian="clamped")
 
 
-def test_the_model_draws_as_its_configuration_says():
+def test_model_draws_as_its_configuration_says():
     frames, images = make_frames((1,)), {}
     for jacobian in ("exact", "clamped"):
         renderer = dataclasses.replace(CONFIG.renderer, jacobian=jacobian, initial_scale=0.29)

@@ -229,7 +229,7 @@ def test_compile(device):
 
 
 # 7 edges
-def test_nothing_to_attend(device):
+def test_empty_patches(device):
     rows, cu = torch.zeros(0, dtype=torch.int64, device=device), torch.zeros(1, dtype=torch.int64, device=device)
     table, x = PatchTable(rows, rows, cu, cu), torch.ones(3, 2, 4, device=device)
     assert not joint_attention(x, x, x, x[:0], x[:0], table, table).any()
@@ -252,7 +252,7 @@ def test_one_table_may_have_all_the_weight(device, which, dtype):
 
 
 @pytest.mark.parametrize("dtype", DTYPES, ids=DTYPES.values())
-def test_a_table_without_keys_has_no_weight_whatever_the_logits(device, dtype):
+def test_table_without_keys_has_no_weight_whatever_the_logits(device, dtype):
     """All logits are far below 0; many queries have keys in one table only."""
     case = joint_case(dtype=dtype)
     q, k, v, other_k, other_v = case.inputs

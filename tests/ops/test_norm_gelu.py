@@ -133,7 +133,7 @@ def test_compiled_equals_eager():
 
 # 7 edges
 @pytest.mark.parametrize("shape", [(0, 4), (3, 0), (1, 1)])
-def test_no_rows_no_channels_and_one_value(shape, device):
+def test_empty_rows_and_channels_and_one_value(shape, device):
     results = gradients(norm_gelu, [t.to(device) for t in inputs(*shape)], cotangent_of(*shape))
     assert results[0].shape == shape
     for result in results:
@@ -141,7 +141,7 @@ def test_no_rows_no_channels_and_one_value(shape, device):
         assert shape[0] or not result.any()
 
 
-def test_a_row_does_not_depend_on_the_rows_it_is_packed_with(device):
+def test_row_does_not_depend_on_the_rows_it_is_packed_with(device):
     x, *others = (t.to(device) for t in inputs(130, 48, dtype=torch.float32))
     alone = norm_gelu(x[77:78], *others)
     assert_same_bits(norm_gelu(x, *others)[77:78], alone)

@@ -264,13 +264,13 @@ def test_compile(device):
 
 @pytest.mark.parametrize("sizes", [(), ((0, 0),), ((0, 3),), ((3, 0), (0, 0))], ids=str)
 @pytest.mark.parametrize("heads", [0, 2])
-def test_nothing_to_attend(device, sizes, heads):
+def test_empty_patches(device, sizes, heads):
     case = random_case(sizes, heads=heads, dtype=torch.float32).to(device)
     for result in gradients(case.attend, case.inputs, cotangent_of(case)):
         assert torch.count_nonzero(result) == 0
 
 
-def test_no_rows(device):
+def test_empty_rows(device):
     case = random_case((), n_keys=0, spare=0, dtype=torch.float32).to(device)
     assert [x.shape for x in gradients(case.attend, case.inputs, cotangent_of(case))] == [(0, 2, 16)] * 4
 
@@ -378,7 +378,7 @@ def test_order_of_queries_inside_a_patch_does_not_matter(device):
     assert_same_bits(shuffled.attend(), case.attend())
 
 
-def test_a_batch_is_its_members(device):
+def test_batch_is_its_members(device):
     sizes = RAGGED[1:] + ((300, 300),)
     whole = random_case(sizes, dtype=torch.float32).to(device)
     # Each patch alone, with its own copies of the key rows it lists.

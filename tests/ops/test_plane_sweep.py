@@ -97,7 +97,7 @@ def test_backward(case, dtype, device):
     assert_close_relative_to_max(ours, expected, f"plane_sweep_grad_{DTYPES[dtype]}", case)
 
 
-def test_the_cost_of_a_constant_volume_is_its_squared_norm():
+def test_cost_of_a_constant_volume_is_its_squared_norm():
     """Features equal to v everywhere, seen inside the source: <v, v> / sqrt(C), whatever the depth."""
     arguments = make(((0,),), channels=4, dtype=torch.float64)
     arguments[0] = torch.ones_like(arguments[0]) * 3
@@ -202,7 +202,7 @@ def with_cotangent(arguments, cotangent, device):
 
 
 @pytest.mark.parametrize("scales", [(1.0,), (1.0, 1e9, 1e-9)])
-def test_a_scene_has_the_same_bits_alone_and_beside_others(scales, device):
+def test_scene_has_the_same_bits_alone_and_beside_others(scales, device):
     arguments = scaled_scenes(3, scales)
     cotangent = cotangent_of([arguments[0], None, None, arguments[3]])
     cotangent[4:8] *= 1e9
@@ -215,7 +215,7 @@ def test_a_scene_has_the_same_bits_alone_and_beside_others(scales, device):
 
 
 @pytest.mark.unraced("launches the kernels of other tests several times")
-def test_a_scene_has_the_same_bits_in_a_batch_that_takes_several_launches(devices):
+def test_scene_has_the_same_bits_in_a_batch_that_takes_several_launches(devices):
     """More pairs than are kept at once, and tiles that see more source pixels than one launch keeps of them."""
     arguments = scaled_scenes(8, (1.0, 30.0), channels=4, depths=64, size=(48, 64))
     zoom = torch.tensor([[3.0, 0, -2 * 32], [0, 3, -2 * 24], [0, 0, 1]])
@@ -324,7 +324,7 @@ def test_empty(shape, device):
     assert features.grad.shape == shape
 
 
-def test_no_depths_and_no_sources(device):
+def test_empty_depths_and_sources(device):
     arguments = [t.to(device) for t in make(depths=4)]
     arguments[3] = arguments[3][:, :0]
     assert plane_sweep(*arguments).shape == (4, 0, 7, 9)
@@ -390,7 +390,7 @@ def test_points_that_no_source_sees_cost_nothing(where, device):
     assert not cost.any() and not features.grad.any()
 
 
-def test_the_border_fades_to_zero():
+def test_border_fades_to_zero():
     """Half a pixel outside, a sample is half the border pixel; a whole pixel outside it is 0."""
     features = torch.ones(1, 1, 1, 3)
     A, inverse_depths = torch.eye(3)[None], torch.ones(1, 1)

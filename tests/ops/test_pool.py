@@ -157,7 +157,7 @@ def test_one_row(device):
 
 
 @pytest.mark.parametrize("channels", [1, 3, 8, 16, 20, 32])
-def test_of_equal_maxima_the_first_listed_gets_the_gradient(channels, device):
+def test_first_of_equal_maxima_gets_the_gradient(channels, device):
     x = torch.ones(4, channels, device=device, requires_grad=True)
     out = pool_max(x, torch.tensor([2, 0, 3, 1], device=device), torch.tensor([0, 3, 4], device=device))
     grad = torch.autograd.grad(out.sum(), x)[0]
@@ -191,13 +191,13 @@ def test_poison_is_refused_on_the_cpu(poison):
             call()
 
 
-def test_a_result_that_finds_no_room_is_named():
+def test_result_beyond_memory_is_named():
     with pytest.raises(MemoryError, match="unpool: there is no memory for the result of n_rows=4611686018427387904"):
         unpool(torch.ones(1, 1), torch.tensor([0]), torch.tensor([0, 1]), 2**62)
 
 
 @pytest.mark.parametrize("what", [None, "3", [1.0], torch.ones(3).to_sparse()])
-def test_what_is_no_dense_tensor_is_named(what):
+def test_sparse_argument_is_named(what):
     with pytest.raises(TypeError, match="pool_max: rows must be a (dense )?tensor; got"):
         pool_max(torch.ones(3, 1), what, torch.tensor([0, 3]))
     with pytest.raises(TypeError, match="n_rows must be a whole number"):
@@ -288,6 +288,6 @@ def test_malformed_arguments_of_unpool_raise():
         unpool(torch.zeros(0, 2), rows[:0], cu_rows[:1], -1)
 
 
-def test_a_wrong_argmax_raises():
+def test_wrong_argmax_raises():
     with pytest.raises(ValueError, match=r"pool_max_backward: argmax must be in \[-1, N\) with N=2; got 2"):
         torch.ops.gsim3d.pool_max_backward(torch.zeros(1, 1), torch.tensor([[2]]), 2)

@@ -230,7 +230,7 @@ def test_compile():
 # 7 edges
 
 
-def test_no_rows_and_no_clouds(device):
+def test_empty_rows_and_clouds(device):
     empty = scene((0,) * 7)
     assert_matches_oracle(empty, SPEC, device=device)
     none = torch.zeros(0, dtype=torch.int64, device=device)
@@ -272,7 +272,7 @@ def test_sleeping_rows_leave_the_others_alone():
         assert torch.equal(a, b)
 
 
-def test_the_last_cell_takes_part(device):
+def test_last_cell_takes_part(device):
     top = 65535.5 * 0.1
     arguments = scene((4, 0, 0, 0, 0, 0, 0), dtype=torch.float64)
     corners = [[top, top, top], [0.0, 0.0, 0.0], [top, 0.0, top], [top - 0.1, top, top]]
@@ -315,7 +315,7 @@ def test_scenes_do_not_change_each_other():
     assert starts == [stage.n_rows for stage in whole.stages]
 
 
-def test_the_order_of_input_rows_permutes_the_results_only():
+def test_order_of_input_rows_permutes_the_results_only():
     arguments = scene()
     arguments["positions"] = torch.rand(151, 3, generator=torch.Generator().manual_seed(5))
     spec = dataclasses.replace(SPEC, grid_size=0.25)

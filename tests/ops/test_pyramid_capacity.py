@@ -73,7 +73,7 @@ def test_given_sizes_hold_the_same_data(curves, factor, device):
 
 
 @pytest.mark.unsanitized("runs the kernels of test_devices_agree_on_given_sizes many times")
-def test_what_does_not_fit_leaves_nothing(device):
+def test_misfitting_checkpoint_writes_nothing(device):
     arguments = on(device, scene())
     exact = build_pyramid(**arguments, spec=SPEC)
     capacity = PyramidCapacity.of(exact, 151, 1.0)
@@ -155,7 +155,7 @@ def test_devices_agree_on_given_sizes(spec, release, devices):
             assert actual.device.type == "cuda" and torch.equal(actual.cpu(), expected)
 
 
-def test_a_graph_makes_the_pyramid_of_other_positions(devices):
+def test_graph_makes_the_pyramid_of_other_positions(devices):
     arguments = on(devices[1], large_scene())
     capacity = PyramidCapacity.of(build_pyramid(**arguments, spec=LARGE), len(arguments["positions"]))
     side = torch.cuda.Stream()

@@ -31,7 +31,7 @@ def spoil_free_memory(device):
         _ = [torch.full((2**20,), 255, dtype=torch.uint8, device=device) for _ in range(2)]
 
 
-def test_no_gaussians(device):
+def test_empty_gaussians(device):
     spoil_free_memory(device)
     scene = facing(torch.zeros(0, 3), background=torch.tensor([[0.1, 0.2, 0.3]])).to(device)
     (color, alpha, depth, _), grads = assert_finite(scene)
@@ -40,7 +40,7 @@ def test_no_gaussians(device):
     assert_close_relative_to_max(grads["background"], scene.cotangents()[0].sum((1, 2)), 1e-6)
 
 
-def test_no_images(device):
+def test_empty_images(device):
     scene = random_scene(n=5)
     none = {name: getattr(scene, name)[:0] for name in ("background", "viewmats", "Ks", "image_cloud")}
     out, grads = assert_finite(scene.replace(**none).to(device))
@@ -103,14 +103,14 @@ def test_faint_gaussians_are_left_out(device, opacity):
     assert all(grads[name].abs().max() == 0 for name in ("means", "quats", "scales", "opacities", "color"))
 
 
-def test_the_faintest_gaussian_is_kept(device):
+def test_faintest_gaussian_is_kept(device):
     # Its alpha is above 1/255 in one pixel only, so bounds that are too tight would lose it.
     scene = facing([1 / 16, 1 / 16, 2.0], scales=0.01, opacities=1.001 / 255).to(device)
     alpha = scene.render()[1]
     assert (alpha > 0).sum() == 1 and alpha[0, 8, 8] > 0
 
 
-def test_nothing_visible_is_lost(device):
+def test_visible_gaussians_are_all_drawn(device):
     # Slanted needles across many tiles, against the oracle that looks at every pixel.
     g = torch.Generator().manual_seed(0)
     n = 40
@@ -307,7 +307,7 @@ def test_bad_rows_are_bounded(device, name, value, message):
     assert {finding.tensor for finding in report.findings} == {message.split(":")[0]}
 
 
-def test_a_gpu_raises_where_the_report_is_read(devices):
+def test_gpu_raises_where_the_report_is_read(devices):
     report = StabilityReport()
     change(four_rows(), "means", 2, NAN).to(devices[1]).render(report=report)
     with pytest.raises(

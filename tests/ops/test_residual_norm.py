@@ -212,7 +212,7 @@ def test_compiled_equals_eager():
 # 7 edges
 @pytest.mark.parametrize("parts", PARTS)
 @pytest.mark.parametrize("shape", [(0, 4), (3, 0), (1, 1)])
-def test_no_rows_no_channels_and_one_value(shape, parts, device):
+def test_empty_rows_and_channels_and_one_value(shape, parts, device):
     values = [t.to(device) for t in inputs(*shape, parts=parts)]
     results = gradients(residual_norm, values, cotangents_of(*shape), parts)
     assert results[0].shape == results[1].shape == shape
@@ -222,7 +222,7 @@ def test_no_rows_no_channels_and_one_value(shape, parts, device):
 
 
 @pytest.mark.parametrize("channels", [48, 19])
-def test_a_row_does_not_depend_on_the_rows_it_is_packed_with(channels, device):
+def test_row_does_not_depend_on_the_rows_it_is_packed_with(channels, device):
     x, branch, keep, *weights = (t.to(device) for t in inputs(130, channels, dtype=torch.float32))
 
     def run(rows, **kw):

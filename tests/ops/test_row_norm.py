@@ -130,7 +130,7 @@ def test_compiled_equals_eager():
 
 
 # 7 edges
-def test_no_rows_and_no_channels(device):
+def test_empty_rows_and_channels(device):
     x = torch.zeros(0, 4, device=device, requires_grad=True)
     weight = torch.ones(4, device=device, requires_grad=True)
     out = row_norm(x, weight, weight)
@@ -148,7 +148,7 @@ def test_equal_channels_are_zero_before_the_shift(device):
     assert torch.isfinite(torch.autograd.grad(out.square().sum(), x)[0]).all()
 
 
-def test_a_row_does_not_depend_on_the_rows_it_is_packed_with(device):
+def test_row_does_not_depend_on_the_rows_it_is_packed_with(device):
     x, weight, bias, residual = (t.to(device) for t in inputs(130, 48, dtype=torch.float32))
     alone = row_norm(x[77:78], weight, bias, residual[77:78])
     assert_same_bits(row_norm(x, weight, bias, residual)[77:78], alone)

@@ -65,7 +65,7 @@ def _off(value):
         ("row_norm", "norm_gelu"),
     ],
 )
-def test_an_op_that_computes_wrongly_is_noticed(monkeypatch, check, op):
+def test_op_that_computes_wrongly_is_noticed(monkeypatch, check, op):
     right = getattr(ops, op)
 
     def wrong(*args, **options):

@@ -375,7 +375,7 @@ def test_compiled_equals_eager():
 
 
 # 7 edges
-def test_no_rows(device):
+def test_empty_rows(device):
     voxels, kernel_map = geometry(torch.zeros(0, 4, dtype=torch.int64), 3, device)
     x, weight, bias, cotangent = (t.to(device) for t in parameters(0, 2, 3, 3))
     out, grad_x, grad_weight, grad_bias = gradients(convolution(voxels, kernel_map), [x, weight, bias], cotangent)
@@ -415,7 +415,7 @@ def test_channel_counts_beside_the_vector_widths(c_in, c_out, device):
         assert_close_relative_to_max(a, b, "sparse_conv_float32")
 
 
-def test_a_cloud_does_not_change_another(device):
+def test_cloud_does_not_change_another(device):
     """Bit for bit, also when the other cloud has shared voxels and is packed before."""
     alone, other = random_cells(50, 6, clouds=1), random_cells(200, 3, clouds=1, seed=5)
     both = torch.cat([other, alone + torch.tensor([1, 0, 0, 0])])

@@ -35,7 +35,7 @@ def test_in_order_without_a_graph():
     assert seen == [1, 2]
 
 
-def test_a_graph_with_branches_has_the_same_bits(devices):
+def test_graph_with_parallel_streams_has_the_same_bits(devices):
     g = torch.Generator().manual_seed(0)
     x, weight = (torch.randn(64, 64, generator=g).to(devices[1]) for _ in range(2))
     expected = chains(x, weight)

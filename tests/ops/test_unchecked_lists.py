@@ -245,7 +245,7 @@ def test_row_scenes_and_cells(indices, offsets, devices):
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32])
 @pytest.mark.parametrize("heads", [2, 96])
-def test_a_patch_without_a_valid_key_has_no_gradient(heads, dtype, devices):
+def test_patch_without_a_valid_key_has_no_gradient(heads, dtype, devices):
     """Nor has it a part in the gradients of the other patches."""
     case = random_case(((70, 90), (20, 33)), heads=heads, dim=16, n_keys=100, dtype=dtype)
     q_rows, kv_rows, cu_q, cu_k = lists(case.table)

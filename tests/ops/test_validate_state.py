@@ -95,7 +95,7 @@ def test_rows_are_mended_only_if_asked():
     assert_same_bits(watched.status, look(state())[0])
 
 
-def test_what_is_counted():
+def test_counts():
     means = torch.tensor(
         [[0.5, 0.5, 0.5], [0.5, float("nan"), 0.5], [-0.1, 0.5, 0.5], [0.9, 0.5, 0.5], [3.0, 0.5, 0.5]]
     )
@@ -228,13 +228,13 @@ def test_any_number_of_threads():
 
 
 @pytest.mark.parametrize("clouds", [[0], [0, 0], [0, 0, 0]])
-def test_no_rows(clouds, device):
+def test_empty_rows(clouds, device):
     status, record, *_ = look(state(clouds, device=device))
     assert status.shape == (0,) and record.shape == (len(clouds) - 1, 2 * 7 + 9)
     assert bool((record[:, 0:14:2] == 0).all()) and bool((record[:, 1:14:2] == -1).all())
 
 
-def test_a_strided_field(device):
+def test_strided_field(device):
     fields, bounds, cu_rows, options = state(device=device)
     strided = [torch.stack([field, field], 1)[:, 0] for field in fields]
     assert not strided[0].is_contiguous()

@@ -49,7 +49,7 @@ def test_particles_lie_on_the_rays_of_their_pixels_between_near_and_far():
     assert in_camera[..., 2].min() >= 1.5 - 1e-4 and in_camera[..., 2].max() <= 6 + 1e-4
 
 
-def test_a_shifted_crop_is_a_shifted_principal_point():
+def test_shifted_crop_is_a_shifted_principal_point():
     """Cropping a feature map by whole feature pixels and shifting the principal point sees the same world."""
     K = make_frames([0]).cameras.Ks
     cropped = K.clone()
@@ -88,7 +88,7 @@ def test_views_of_one_count_or_another_in_one_call():
             assert_close_relative_to_max(rows, getattr(alone, name), "encoder_order", name)
 
 
-def test_a_cloud_does_not_change_its_neighbours():
+def test_cloud_does_not_change_its_neighbours():
     frames = make_frames([0, 0, 1, 1, 2])
     encoder = make_encoder()
     before = encoder(frames)
@@ -110,7 +110,7 @@ def test_permuted_views_permute_particles():
             assert_close_relative_to_max(a, b, "encoder_order")
 
 
-def test_a_moved_scene_gives_moved_particles():
+def test_moved_scene_gives_moved_particles():
     """Cameras and origin move along; features do not notice."""
     frames = make_frames([0, 0, 0])
     shift = torch.tensor([4.0, -3.0, 2.0], dtype=torch.float64)
@@ -240,7 +240,7 @@ def test_upsampling(factor, aligned):
     assert torch.allclose(upsampling_matrix(5, factor, depth.upsampling_stride(5), x).sum(1), torch.ones(5 * factor))
 
 
-def test_the_paper_s_size():
+def test_sizes_of_the_paper():
     """Parameters of the published encoders: latents of 64 and 64, of 32 and 32 channels, and the explicit variant."""
     with torch.device("meta"):
         sizes = [
@@ -376,7 +376,7 @@ def test_config_errors(changes, message):
         EncoderConfig(**changes)
 
 
-def test_particles_in_given_room_are_those_of_their_clouds():
+def test_static_shapes_hold_the_particles_of_their_clouds():
     """Other images and cameras than those that the shapes was made of; two clouds of two views."""
     encoder, frames = make_encoder(), make_frames([0, 0, 1, 1])
     chance = torch.rand(frames.images[:, :2].shape, generator=torch.Generator().manual_seed(3))
@@ -406,7 +406,7 @@ def test_particles_in_given_room_are_those_of_their_clouds():
     assert torch.equal(few.means[:100], whole.means[:100]) and few.activity.ne(ASLEEP).all()
 
 
-def test_room_is_for_clouds_of_equal_views_in_order():
+def test_static_shapes_need_equal_views_in_order():
     for clouds in ([0, 0, 1], [1, 0]):
         with pytest.raises(InputError, match="image_cloud"):
             make_encoder().static_shapes(make_frames(clouds), 100)
@@ -425,7 +425,7 @@ class Calls(TorchDispatchMode):
 
 
 @pytest.mark.parametrize("explicit", [False, True])
-def test_nothing_waits_for_the_device_in_given_room(explicit):
+def test_static_shapes_do_not_wait_for_the_device(explicit):
     """Nor is anything sent there: operators that read numbers or make tensors of them are not called."""
     encoder, frames = make_encoder(explicit=explicit), make_frames([0, 0, 1, 1])
     frames = dataclasses.replace(frames, masks=frames.images[:, 0] < 0.4, dynamic=frames.images[:, 1] < 0.5)
