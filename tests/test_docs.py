@@ -146,3 +146,10 @@ def test_text_is_short():
 def test_figures_are_small():
     for picture in [*(DOCS / "figures").glob("*.svg"), *(DOCS / "figures").glob("*.png")]:
         assert picture.stat().st_size < 100_000, picture
+
+
+def test_pages_that_code_names_exist():
+    files = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True).stdout.split()
+    code = [ROOT / file for file in files if file.endswith((".py", ".sh", ".yaml", ".yml", ".toml", ".cpp", ".h"))]
+    named = {name for file in code if file.is_file() for name in re.findall(r"docs/[\w/.-]+\.md", file.read_text())}
+    assert not [name for name in named if not (ROOT / name).is_file()]
