@@ -1,6 +1,6 @@
 """The published model: this one, but for what its weights were trained with.
 
-Each override below is one line of the release that :mod:`gsim3d` corrects; docs/compat/differences.md has what else differs.
+Each override below is one line of the release that :mod:`gsim3d` corrects; docs/compat/differences.md has the rest.
 :func:`as_released` gives the parts of a network the classes of this file, so that names of weights stay.
 """
 
