@@ -11,9 +11,9 @@ from pathlib import Path
 
 import torch
 
-from gsim3d import presets, pretrained
+from gsim3d import presets
 from gsim3d.compat.checkpoints import current_model
-from gsim3d.compat.released_model import ReleasedModelConfig, simulator_class
+from gsim3d.compat.released_model import ReleasedModelConfig, ReleasedSimulator, simulator_class
 from gsim3d.data import Scene
 from gsim3d.data.fitting import frame_stride
 from gsim3d.effects.plan import Plan
@@ -193,28 +193,14 @@ def restore(path: str | Path, device: str = "cpu") -> Restored:
     """
     check_device(device)
     saved = checkpoint.load(path)
+    cls = ReleasedSimulator if loading.is_released(saved.config) else Simulator
+    simulator = loading.of_checkpoint(cls, saved, path)
+    data = {key: value for key, value in saved.config["data"].items() if key not in ("image_size", "fps")}
+    if isinstance(data.get("near_far"), str):  # "of each scene", as version 0.1 wrote
+        data.pop("near_far")
     try:
-        return _restored(path, saved, device)
-    except InputError:
-        raise
-    except Exception as error:  # a configuration that describes no model raises anything
-        said = " ".join(str(error).split())[:200]
-        raise InputError(f"{path}: its configuration describes no model: {type(error).__name__}: {said}") from None
-
-
-def _restored(path: str | Path, saved: checkpoint.Checkpoint, device: str) -> Restored:
-    released = loading.is_released(saved.config)
-    try:
-        kind = ReleasedModelConfig if released else ModelConfig
-        found = loading.describe(saved.config, kind, pretrained.frame_rate(path))
-        data = {key: value for key, value in saved.config["data"].items() if key not in ("image_size", "fps")}
-        if isinstance(data.get("near_far"), str):  # "of each scene", as version 0.1 wrote
-            data.pop("near_far")
         settings = from_dict(DataConfig, upgraded(DataConfig, data), "data")
-        make = simulator_class(found.model)
-        simulator = loading.with_weights(make, found.model, found.effects, saved.weights)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    simulator.inputs = found.inputs
-    plan, size = simulator.plan(), tuple(found.inputs.image_size)
-    return Restored(simulator.eval().to(device), settings, size, plan, saved, found.inputs.fps)
+    inputs = simulator.inputs
+    return Restored(simulator.to(device), settings, tuple(inputs.image_size), simulator.plan(), saved, inputs.fps)
