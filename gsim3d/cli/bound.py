@@ -10,7 +10,7 @@ EPILOG = """\
 The scenes of a set that gsim3d generate made are simulated again, with errors in how bodies start that images leave
 open, and rendered exactly:
 
-  elastic, cloth   velocity 0.42 mm a step, place 2 mm, angle 10 mrad
+  elastic, cloth   velocity 0.42 mm a step, position 2 mm, angle 10 mrad
   rigid            velocity 1 mm a step, spin 3 %
 
 All of the last of the four given steps, of this length and in random directions. "one" is the PSNR of one such

@@ -72,8 +72,8 @@ def _command(arguments: list[str]) -> int:
     except UnicodeEncodeError as error:
         return _fail(f"{error.object[:200]!r}: names must be valid Unicode")
     except OSError as error:  # a full disk names no file
-        place = error.filename or getattr(args, "out", None)
-        return _fail(f"{place}: {error.strerror}" if place and error.strerror else str(error))
+        path = error.filename or getattr(args, "out", None)
+        return _fail(f"{path}: {error.strerror}" if path and error.strerror else str(error))
     except (RuntimeError, MemoryError) as error:
         from gsim3d.cuda_graphs import is_out_of_memory
 
@@ -112,11 +112,11 @@ def _no_command(arguments: list[str]) -> int:
     parser.error(f"unknown command {given!r}; commands: {', '.join(COMMANDS)}{did_you_mean(given, COMMANDS)}")
 
 
-def _show_warning(otherwise, message, category, *place, **more) -> None:
+def _show_warning(otherwise, message, category, *location, **more) -> None:
     if issubclass(category, FitWarning):
         print(f"gsim3d: {message}", file=sys.stderr)
     else:
-        otherwise(message, category, *place, **more)
+        otherwise(message, category, *location, **more)
 
 
 def _fail(message: str) -> int:

@@ -42,9 +42,9 @@ def run(args: argparse.Namespace) -> int:
         simulator = build_simulator(presets.tiny(), seed=0)
         own, source = simulator.plan(), "none, so the model's own"
     else:
-        restored, place = restore(args.checkpoint), located(args.checkpoint)
+        restored, path = restore(args.checkpoint), located(args.checkpoint)
         scene = restored.open_scene(args.scene, args.keep, args.resample)
-        times = load_times(place if place.is_dir() else place.parent, restored)
+        times = load_times(path if path.is_dir() else path.parent, restored)
         data, simulator = restored.data_of(scene), restored.simulator
         own, source = restored.plan, "the checkpoint's"
     spec = EffectsSpec.of_scene(args.scene)

@@ -188,9 +188,9 @@ class EffectsSpec:
     def of_scene(cls, folder: str | Path) -> EffectsSpec | None:
         """The spec of effects.yaml in ``folder``, of a scene, or up to two folders above (a whole set's); else None."""
         folder = Path(folder).absolute()
-        for place in (folder, folder.parent, folder.parent.parent):
-            if (place / FILE).is_file():
-                return cls.load(place / FILE)
+        for around in (folder, folder.parent, folder.parent.parent):
+            if (around / FILE).is_file():
+                return cls.load(around / FILE)
         return None
 
     def save(self, path: str | Path) -> None:

@@ -47,13 +47,13 @@ class Finding:
     camera: int | None = None
 
     def __str__(self) -> str:
-        place = [
+        location = [
             f"{name} {value}" for name in ("scene", "step", "camera") if (value := getattr(self, name)) is not None
         ]
-        place = f" ({', '.join(place)})" if place else ""
+        location = f" ({', '.join(location)})" if location else ""
         row = "" if self.row is None else f" at row {self.row}"
         more = f" and {self.count - 1} more" if self.count > 1 else ""
-        return f"{self.where}: {self.tensor}: {self.what}{row}{place}{more}"
+        return f"{self.where}: {self.tensor}: {self.what}{row}{location}{more}"
 
     def error(self) -> NumericalError:
         """The error that names the finding and says what to do."""
@@ -168,19 +168,19 @@ class StabilityReport:
         self.is_closed = True
 
     def add(self, finding: Finding) -> None:
-        """Counts ``finding``; those of the same kind and place become one."""
-        place = (finding.what, finding.where, finding.tensor, finding.action)
-        place += (finding.scene, finding.step, finding.camera)
+        """Counts ``finding``; those of the same kind and location become one."""
+        key = (finding.what, finding.where, finding.tensor, finding.action)
+        key += (finding.scene, finding.step, finding.camera)
         with self._lock:
             self._total += finding.count
             if finding.action == "error":
                 self._errors.append(finding)  # of this call alone, whose rows its message counts
                 self._first_error = self._first_error or finding
-            known = self._found.get(place)
+            known = self._found.get(key)
             if known is not None:
-                finding = Finding(*place[:4], known.count + finding.count, known.row, *place[4:])
+                finding = Finding(*key[:4], known.count + finding.count, known.row, *key[4:])
             if known is not None or len(self._found) < MAX_FINDINGS:
-                self._found[place] = finding
+                self._found[key] = finding
 
     def record(
         self,

@@ -84,11 +84,11 @@ class Deviation:
 Check = Callable[[Simulator, Sample], Iterator[Deviation]]
 
 
-def compare(what: str, actual: Tensor, expected: Tensor, bound: float, place: Callable[[int], str]) -> Deviation:
+def compare(what: str, actual: Tensor, expected: Tensor, bound: float, name_of: Callable[[int], str]) -> Deviation:
     """The deviation of ``actual`` from ``expected``, both [N, ...]; values that are not finite are an infinite error.
 
     Args:
-        place: index of the first dimension -> its name.
+        name_of: index of the first dimension -> its name.
     """
     if actual.shape != expected.shape:
         return Deviation(what, float("inf"), bound, f"shape {list(actual.shape)}, expected {list(expected.shape)}")
@@ -98,7 +98,7 @@ def compare(what: str, actual: Tensor, expected: Tensor, bound: float, place: Ca
     error = torch.where(error.isfinite(), error, torch.inf).reshape(len(error), -1).amax(1)
     worst = int(error.argmax())
     scale = float(expected.detach().abs().max()) if bound else 1.0
-    return Deviation(what, float(error[worst]) / max(scale, 1e-30), bound, place(worst))
+    return Deviation(what, float(error[worst]) / max(scale, 1e-30), bound, name_of(worst))
 
 
 def compare_particles(

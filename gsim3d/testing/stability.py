@@ -399,8 +399,8 @@ def replay(path: str | Path, device: str = "cpu") -> Report:
     sample, what = load_sample(path)
     subject = open_subject(what.get("checkpoint") or what["preset"].partition(",")[0], device)
     plan = subject.restored.plan if subject.restored else None
-    place = next(subject.simulator.parameters()).device
-    sample = dataclasses.replace(sample, frames=sample.frames.to(place), targets=sample.targets.to(place), plan=plan)
+    on = next(subject.simulator.parameters()).device
+    sample = dataclasses.replace(sample, frames=sample.frames.to(on), targets=sample.targets.to(on), plan=plan)
     findings = [finding for finding, _ in check(subject, sample, sample.n_steps, [what["check"]])]
     return Report(subject.origin | {"replayed": str(path)}, (), tuple(findings))
 

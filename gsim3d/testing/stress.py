@@ -198,7 +198,7 @@ def not_a_number(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
 
 
 def _refuses(what: str, call: Callable, names: str) -> Deviation:
-    """Whether ``call`` raises a NumericalError that names the place."""
+    """Whether ``call`` raises a NumericalError that names the scene, image or camera."""
     try:
         call()
     except NumericalError as error:
@@ -224,7 +224,11 @@ def crowds(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
         CloudTable.make((2 * table.count(q) for q in range(len(table))), table.scenes, table.steps, device),
         **{name: value[twice] for name, value in state.row_fields().items()},
     )
-    for name, crowd in {"one particle": lonely, "all in one place": gathered, "every particle twice": doubled}.items():
+    for name, crowd in {
+        "one particle": lonely,
+        "all at one position": gathered,
+        "every particle twice": doubled,
+    }.items():
         steps = simulator.rollout(crowd, sample.n_steps, sample.plan, report=StabilityReport())
         yield from _finite(f"{name}: rollout's", steps[-1])
         yield _finite_image(f"{name}:", simulator, steps[-1], sample.targets)

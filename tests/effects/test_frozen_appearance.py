@@ -114,7 +114,7 @@ def test_frozen_appearance_with_every_background(model, background):
 
 @pytest.mark.parametrize("model", ["latent", "asymmetric"])
 def test_frozen_appearance_of_captured_rollout(model, device):
-    """Of a state that a rollout left, those who were named before, though all have moved away."""
+    """Of a state from a rollout, the particles that were selected before, though all have moved away."""
     case = Case(MODELS[model], steps=(1,))
     dtype = torch.float32 if device.type == "cpu" else torch.float64  # see tests/test_cuda_graphs.py
     simulator = case.simulator.to(device, dtype)
@@ -210,7 +210,7 @@ def test_changing_frozen_keeps_appearance_of_bodies(model):
     case = Case(MODELS[model])
     start, (first, *_), (free, *_) = (
         last_steps(case.state, 1),
-        *(rolled(case, {"appearance": {"changing": who}}) for who in ("frozen", "all")),
+        *(rolled(case, {"appearance": {"changing": which}}) for which in ("frozen", "all")),
     )
     frozen = start.activity == FROZEN
     assert 0 < int(frozen.sum()) < start.n_rows

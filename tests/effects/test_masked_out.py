@@ -38,7 +38,7 @@ def test_frozen_background_changes_prediction():
     still = frozen.activity == FROZEN
     assert_same_bits(frozen.means[still], last_steps(state, 1).means[still])
     assert masked.n_rows == int((~still).sum()), "absent"
-    assert not torch.equal(masked.means, frozen.means[~still]), "who moves feels whether a ground is there"
+    assert not torch.equal(masked.means, frozen.means[~still]), "moving particles read the background"
 
 
 def test_masked_out_background_has_no_influence():

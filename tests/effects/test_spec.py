@@ -26,7 +26,7 @@ from tests.asserts import assert_same_bits
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-ROOMS = {
+GROUPS = {
     "dynamics": [
         DynamicsEffects(),
         DynamicsEffects("masked_out", 2),
@@ -43,7 +43,7 @@ ROOMS = {
     "structure": [StructureEffects(), StructureEffects(True, False), StructureEffects(True, True)],
     "outputs": [OutputEffects(), OutputEffects(False, True, True, True)],
 }
-SPECS = [EffectsSpec(**dict(zip(ROOMS, rooms))) for rooms in itertools.product(*ROOMS.values())]
+SPECS = [EffectsSpec(**dict(zip(GROUPS, groups))) for groups in itertools.product(*GROUPS.values())]
 
 
 def test_spec_round_trip():

@@ -18,7 +18,7 @@ from tests.data.made_scenes import WRITERS, edit_json, make_scene
 from tests.nn.multiview_encoder.scenes import SIZE, make_encoder
 from tests.ops.test_plane_sweep import make as make_sweep
 from tests.oracle import plane_sweep as sweep_oracle
-from tests.stability.beside import check_encoding, encode, ordinary, with_cameras
+from tests.stability.encodings import check_encoding, encode, ordinary, with_cameras
 
 NAN, INF = float("nan"), float("inf")
 TURNED = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0], dtype=torch.float64))  # half a turn about the camera's y

@@ -1,4 +1,4 @@
-"""The encoder on a hard cloud beside an ordinary one in the same call."""
+"""Encodings of a hard cloud and an ordinary one in the same call."""
 
 import dataclasses
 from dataclasses import dataclass
