@@ -138,6 +138,7 @@ class _Convergence:
 
     @property
     def fits(self) -> bool:
+        """Whether all cameras look at one point."""
         return self.plausible == 1 and self.error < MAX_ERROR
 
 

@@ -44,6 +44,7 @@ QUATERNION_TOLERANCE = 1e-2
 
 
 def recognises(folder: Path) -> bool:
+    """Whether ``folder`` has a sparse model."""
     return _model_of(folder) is not None
 
 

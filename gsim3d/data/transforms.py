@@ -36,6 +36,7 @@ SAME_TIME = 1e-6  # of the whole duration: times closer than that are one step
 
 
 def recognises(folder: Path) -> bool:
+    """Whether ``folder`` has a transforms.json, or splits of NeRF-synthetic."""
     return any((folder / name).is_file() for name in (FILE, *SPLITS))
 
 
@@ -214,6 +215,7 @@ class _CameraFrames:
         return read_files((self._file(key, step) for step in steps), self.size, convert, problems)
 
     def has_alpha(self) -> bool:
+        """Whether its first image has transparency."""
         header = header_of(*self._file("file_path", 0), Problems(collect=True))
         return header is not None and header.alpha
 

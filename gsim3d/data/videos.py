@@ -310,6 +310,7 @@ class _Frames:
         return False
 
     def read(self, numbers: Sequence[int], problems: Problems, convert=as_color) -> Iterator[np.ndarray | None]:
+        """``convert`` of the images of these numbers; None where there is a problem."""
         if not self._files:  # reported when the scene was opened
             yield from [None] * len(numbers)
             return

@@ -25,6 +25,7 @@ def orbit_frames(frames: Iterable[Gaussians], count: int, size: int, turns: floa
     Args:
         frames: one packed frame each, z up.
         count: how many there are.
+        size: width and height of the images, pixels.
         turns: of the camera, over all frames.
     """
     centre = distance = None

@@ -87,6 +87,9 @@ def read_columns(path: Path, content: bytes, header: Header, *names: str) -> dic
     """The columns of elements, without their lists.
 
     Args:
+        path: for messages.
+        content: of the file.
+        header: of the file.
         names: of the elements that are needed, in any order.
 
     Returns:

@@ -46,6 +46,7 @@ def open_sequence(target: str | Path, up: str | None = None) -> Sequence:
     """The frames of ``target``: a file of Gaussians, a folder of such files, or a folder that has them in gaussians/.
 
     Args:
+        target: file or folder.
         up: axis that points up in the files (default: as their formats say).
     Raises:
         InputError: there are none, or they are of several formats.

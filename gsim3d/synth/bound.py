@@ -73,6 +73,7 @@ def bound(
         processes: None: as many as there are cores.
         out: folder for bound.json and the squared errors of each scene, which are not computed again; None: nothing
             is written.
+        progress: show a progress bar.
 
     Returns:
         What bound.json holds. Of "one" (one simulation) and "mean" (the mean image of four), with "_given" where the

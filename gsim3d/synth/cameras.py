@@ -27,6 +27,7 @@ class Rig:
 
     @property
     def n_cams(self) -> int:
+        """Number of cameras."""
         return len(self.viewmats)
 
 

@@ -87,13 +87,12 @@ def generate(
     with only_one_writer(out, mine):
         scenes = scenes if mine is None else [scenes[i] for i in mine]
         fingerprints = {name: settings.fingerprint(name) for name in settings.object_names()}
-        folders = [writer.scene_folder(out, *scene) for scene in scenes]
-        missing = [
-            scene for scene, folder in zip(scenes, folders) if not writer.is_finished(folder, fingerprints[scene[0]])
-        ]
+        folders = {scene: writer.scene_folder(out, *scene) for scene in scenes}
+        missing = [scene for scene in scenes if not writer.is_finished(folders[scene], fingerprints[scene[0]])]
         jobs = [(settings, out, scene) for scene in missing]
         for _ in each(_make_one, jobs, processes, "scenes" if progress else None):
             pass
+        folders = list(folders.values())
         if part is None:
             settings.effects().save(out / EFFECTS_FILE)
             writer.write_manifest(out, folders, {"world": world, **dataclasses.asdict(settings)})
@@ -185,6 +184,8 @@ def write_trajectory(world: World, scene: tuple[str, int], file: str) -> str:
     """Writes one trajectory as arrays, without files of images.
 
     Args:
+        world: settings.
+        scene: object and sample.
         file: name of the .npz: images uint8 [T, V, H, W, 4], colours and the label of seg images; viewmats
             [V, 4, 4] and Ks [V, 3, 3].
 
