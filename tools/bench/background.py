@@ -7,14 +7,7 @@ tenth.
 import torch
 from harness import Bench
 
-from gsim3d.ops import (
-    PatchTable,
-    add_cells,
-    curve_encode,
-    find_cells,
-    joint_attention,
-    overlapping_patches,
-)
+from gsim3d.ops import PatchTable, add_cells, curve_encode, find_cells, joint_attention, overlapping_patches
 from gsim3d.ops.curve import CURVES
 
 CLOUDS, CHANNELS, HEADS, PATCH, SIDE = 4, 64, 4, 1024, 64

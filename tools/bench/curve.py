@@ -1,5 +1,7 @@
 """Codes along four curves, their order, and all geometry of a network call, against plain torch."""
 
+from functools import partial
+
 import torch
 from harness import Bench
 
@@ -112,57 +114,34 @@ def network_input(spec, n=65536):
 NETWORK = PyramidSpec(0.004, 0, (4, 2, 2, 2), (1, 1, 1, 1), (1024,) * 5, ((5, 3), (3,), (3,), (3,), (3,)))
 
 
-def gpu(bench):
+def cases(device: torch.device):
+    """(name, ours, plain, goals on a GPU)"""
     for n in (65536, 262144):
-        generator = torch.Generator(device="cuda").manual_seed(n)
-        grid = (torch.rand(n, 3, generator=generator, device="cuda") * 60000).long()
-        cloud = torch.zeros(n, dtype=torch.int64, device="cuda")
+        if device.type == "cuda":
+            generator = torch.Generator(device=device).manual_seed(n)
+            grid = (torch.rand(n, 3, generator=generator, device=device) * 60000).long()
+            cloud = torch.zeros(n, dtype=torch.int64, device=device)
+        else:
+            grid = torch.floor(surface(4, n // 4) / 0.004).long()
+            cloud = torch.arange(4).repeat_interleave(n // 4)
+        size = f"{n // 1024}k"
         codes = ours(grid, cloud)[0]
-        bench.gpu(
-            f"4 sorts and inverses of {n // 1024}k",
-            "int64",
-            lambda: curve_sort(codes),
-            {"torch.argsort": lambda: plain_sort(codes)},
-            tolerance=0,
-        )
-        bench.gpu(
-            f"4 codes and their sorts, {n // 1024}k points",
-            "int64",
-            lambda: ours(grid, cloud),
-            {"torch": lambda: plain(grid, cloud)},
-            tolerance=0,
-            target_ratio=60,
-            limit_ms=0.02 * n / 262144,
-        )
-    positions = network_input(NETWORK).cuda()
+        goals = {"target_ratio": 60, "limit_ms": 0.02 * n / 262144}
+        yield f"4 sorts and inverses of {size}", partial(curve_sort, codes), partial(plain_sort, codes), {}
+        yield f"4 codes and their sorts, {size} points", partial(ours, grid, cloud), partial(plain, grid, cloud), goals
+    positions = network_input(NETWORK).to(device)
     grid = torch.floor(positions.double() / NETWORK.grid_size).long()
-    bench.gpu(
-        f"geometry of 5 stages, {len(grid)} points",
-        "int64",
-        lambda: our_pyramid(positions, NETWORK),
-        {"torch": lambda: plain_pyramid(grid, NETWORK)},
-        tolerance=0,
-    )
+    both = partial(our_pyramid, positions, NETWORK), partial(plain_pyramid, grid, NETWORK)
+    yield f"geometry of 5 levels, {len(grid)} points", *both, {}
 
 
 def main():
     bench = Bench("curve")
-    if bench.device.type == "cuda":
-        gpu(bench)
-        return bench.finish()
-    for n in (65536, 262144):
-        grid = torch.floor(surface(4, n // 4) / 0.004).long()
-        cloud = torch.arange(4).repeat_interleave(n // 4)
-        codes = ours(grid, cloud)[0]
-        bench.compare(f"4 codes of {n // 1024}k points", lambda: ours(grid, cloud)[0], lambda: plain(grid, cloud)[0])
-        bench.compare(f"4 sorts and inverses of {n // 1024}k", lambda: curve_sort(codes), lambda: plain_sort(codes))
-        bench.compare(f"both of {n // 1024}k", lambda: ours(grid, cloud), lambda: plain(grid, cloud))
-    positions = network_input(NETWORK)
-    bench.compare(
-        f"geometry of 5 stages, {len(positions)} points",
-        lambda: our_pyramid(positions, NETWORK),
-        lambda: plain_pyramid(torch.floor(positions.double() / NETWORK.grid_size).long(), NETWORK),
-    )
+    for name, run, peer, goals in cases(bench.device):
+        if bench.device.type == "cuda":
+            bench.gpu(name, "int64", run, {"torch": peer}, tolerance=0, **goals)
+        else:
+            bench.compare(name, run, peer)
     bench.finish()
 
 

@@ -85,12 +85,8 @@ def rows(config, n: int, device: str):
     plain = rollout(simulator, state, {}), images(simulator, large, {})
     flat = {"appearance": {"view_dependent": 0}}
     yield "off: time merging", rollout(one, first, {}), rollout(without_merging(one), first, {}), OFF
-    yield (
-        "off: view-dependent colour",
-        images(simulator, large, flat),
-        images(of_degree_zero(simulator), large, {}),
-        OFF,
-    )
+    degree_zero = images(of_degree_zero(simulator), large, {})
+    yield "off: view-dependent colour", images(simulator, large, flat), degree_zero, OFF
     yield "idle: insertion, removal", rollout(simulator, state, EDITABLE), plain[0], IDLE
     yield "idle: sleep", rollout(simulator, state, {"dynamics": {"sleep": {"eps": 0.0}}}), plain[0], IDLE
     yield "idle: depth and alpha images", images(simulator, large, EVERY_IMAGE), plain[1], IDLE
@@ -102,12 +98,8 @@ def rows(config, n: int, device: str):
     ):
         without = rollout(simulator, state, less) if device == "cpu" else captured(simulator, many, less)
         yield f"on: {case}", whole, without, None
-    yield (
-        f"on: view-dependent colour, degree {config.renderer.sh_degree}",
-        plain[1],
-        images(simulator, large, flat),
-        None,
-    )
+    case = f"on: view-dependent colour, degree {config.renderer.sh_degree}"
+    yield case, plain[1], images(simulator, large, flat), None
     features = images(simulator, large, {"outputs": {"features": True}})
     yield f"on: feature images, {config.renderer.latents} channels", features, plain[1], None
     depth = images(simulator, large, {"outputs": {"rgb": False, "depth": True}})

@@ -2,9 +2,10 @@
 GPU against gsplat, where it is installed, on batches of scenes of a feed-forward model and on one large scene."""
 
 import math
+from itertools import pairwise
 
 import torch
-from harness import Bench
+from harness import Bench, with_gradients
 from raster_scenes import layered_scene, packed, pixel_aligned_scene, repeated, sh_of
 
 from gsim3d.math.spherical_harmonics import sh_basis
@@ -78,17 +79,6 @@ def plain_image(inputs, W, t):
     return image.reshape(SIZE, SIZE, 5)
 
 
-def with_gradients(inputs, f):
-    leaves = [x.clone().requires_grad_() for x in inputs]
-    cotangent = torch.randn(IMAGES, SIZE, SIZE, 5, generator=torch.Generator().manual_seed(1))
-
-    def run():
-        out = f(leaves)
-        return [out.detach(), *torch.autograd.grad(out, leaves, cotangent)]
-
-    return run
-
-
 def gsplat_rasterization():
     """gsplat's function, or None where it is not installed."""
     try:
@@ -121,33 +111,21 @@ def gpu_case(bench, peer, name, scene, sh, targets):
         )
         return image.flatten(0, 1)
 
-    def both(f):
-        inputs = [x.detach().requires_grad_() for x in leaves]
-
-        def run():
-            image = f(*inputs)
-            return [image.detach(), *torch.autograd.grad((image * image).mean(), inputs)]
-
-        return run
-
     # gsplat cuts alpha at 0.999 where this renderer cuts at 0.99, and drops what is beyond three standard deviations.
-    if peer is not None:
-        error = differences(both(ours)(), both(gsplat)())
+    forms = {"gsplat": gsplat} if peer else {}
+    if peer:
+        error = differences(*(run() for run in with_gradients(leaves, ours, gsplat)))
         print("  difference of image and gradients:", " ".join(f"{e:.1e}" for e in error))
         if not max(error) < 0.05:
             raise AssertionError(f"raster, {name}: differs from gsplat: {error}")
-    with torch.no_grad():
-        peers = {"gsplat": lambda: gsplat(*leaves)} if peer else {}
-        bench.gpu(f"{name}: fwd", "float32", lambda: ours(*leaves), peers, tolerance=None, **targets[0])
-    peers = {"gsplat": both(gsplat)} if peer else {}
-    bench.gpu(f"{name}: fwd+bwd", "float32", both(ours), peers, tolerance=None, **targets[1])
+    bench.passes(name, leaves, ours, forms, tolerance=None, **targets)
 
 
 def gpu(bench):
     device, peer = bench.device, gsplat_rasterization()
 
     def target(ratio, *limits):
-        return [{"target_ratio": ratio, "limit_ms": limit} for limit in limits]
+        return {"ratio": ratio, "limits_ms": limits}
 
     small = pixel_aligned_scene(4, 128, 9, 11, device)
     gpu_case(bench, peer, "4 x 9 views, 128 px, 65k, SH0", small, sh_of(small, 0, 7), target(8, 0.092, 0.163))
@@ -172,23 +150,18 @@ def main():
         sh = sh_of(given, math.isqrt(sh_terms) - 1, 7)
         inputs = [given[key].flatten(0, 1) for key in ("means", "quats", "scales", "opacities")] + [sh.flatten(0, 1)]
 
-        def ours(x):
+        def ours(*x):
             out = rasterize_gaussians(*x[:4], cameras, sh=x[4], cu_rows=cu_rows)
             return torch.cat([out.color, out.depth[..., None], out.alpha[..., None]], -1)
 
-        def plain(x):
-            borders = cu_rows.tolist()
-            return torch.stack(
-                [
-                    plain_image([v[borders[i] : borders[i + 1]] for v in x], pose[:3, :3], pose[:3, 3])
-                    for i, pose in enumerate(cameras.viewmats)
-                ]
-            )
+        def plain(*x):
+            clouds = [[v[i:j] for v in x] for i, j in pairwise(cu_rows.tolist())]
+            poses = cameras.viewmats
+            return torch.stack([plain_image(c, p[:3, :3], p[:3, 3]) for c, p in zip(clouds, poses, strict=True)])
 
         name = f"{IMAGES} x {SIZE} px x 16k, SH{math.isqrt(sh_terms) - 1}"
         # Rounding may move an alpha across 1/255, or a depth across another; a few such pixels would show here.
-        bench.compare(name, lambda: ours(inputs), lambda: plain(inputs), tolerance=1e-4)
-        bench.compare(f"{name}, fwd+bwd", with_gradients(inputs, ours), with_gradients(inputs, plain), tolerance=1e-4)
+        bench.passes(name, inputs, ours, {"tiles in torch": plain}, tolerance=1e-4)
     bench.finish()
 
 
