@@ -11,7 +11,7 @@ from gsim3d.pretrained import CHECKPOINT_HELP
 EPILOG = """\
 Runs the simulator under every setting that it has here, one changed at a time: precision, graph capture, input views
 and steps, particles kept, sleep, patch and grid size, ... For each: how far it is from the reference run of the same
-checkpoint (float32, nothing left out) and from the film, and what a step takes, by section. Written to DIR:
+checkpoint (float32, nothing left out) and from the video, and what a step takes, by section. Written to DIR:
 report.html (one page, needs no network), report.json, report.csv, a PNG of each figure. Beside the checkpoint:
 speeds.json, the fastest settings that keep 99.9 % ("balanced") and 99 % ("fast") of the reference's gain over particles
 that hold still, for --speed, and the times of the reference, by which `gsim3d plan` predicts milliseconds.
@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--out", metavar="DIR", required=True, help="folder of the report; made if absent")
     add("--preset", choices=("quick", "full"), default="quick", help="how long to measure (default: quick)")
     add("--settings", nargs="+", metavar="NAME", help="change only these (default: all)")
-    add("--metrics", nargs="+", metavar="METRIC", help="of the error against the film, as of gsim3d evaluate")
+    add("--metrics", nargs="+", metavar="METRIC", help="of the error against the video, as of gsim3d evaluate")
     limit = "end in about so many; the report says what there was no time for (default: no limit)"
     add("--minutes", type=number(0, 1e6, above=True), metavar="M", help=limit)
     add("--device", choices=("cpu", "cuda"), default="cpu", help="where to simulate (default: cpu)")
@@ -56,8 +56,8 @@ def run(args: argparse.Namespace) -> int:
 
         content, files = profile(out=Path(args.out), progress=advance, **options)
     print(table(content))
-    for name, place in content["presets"].items():
-        row = content["settings"][place]
+    for name, index in content["presets"].items():
+        row = content["settings"][index]
         print(f"--speed {name}: {row['name']}, {row['step_ms']['median']:.2f} ms a step")
     print("written: " + ", ".join(map(str, files)))
     return 0

@@ -66,7 +66,7 @@ img{max-width:100%}code{background:#f3f3f3;padding:2px 4px;white-space:pre-wrap}
 EXPLAINED = """\
 Time of one simulated step and its images at batch 1, median and 95th percentile. agreement and position (of moving
 particles, the largest, in cells) are against the reference run of the same checkpoint, the columns behind kept against
-the film. kept: share of the reference's gain over particles held still, in dB. A tie is a difference in time below what
+the video. kept: share of the reference's gain over particles held still, in dB. A tie is a difference in time below what
 two measurements of one thing differ by. Bold: no other setting is both faster and nearer to the reference."""
 
 
@@ -99,8 +99,9 @@ def profile(
     effort = replace(QUICK if quick else FULL, few=quick and settings is None)
     measured, not_measured = measurable(metrics)
     if quick and metrics is None:
-        not_measured |= dict.fromkeys(SLOW_METRICS, "slow: named with --metrics, or --preset full")
-        measured = tuple(name for name in measured if name not in SLOW_METRICS)
+        slow = [name for name in measured if name in SLOW_METRICS]
+        not_measured |= dict.fromkeys(slow, "slow: named with --metrics, or --preset full")
+        measured = tuple(name for name in measured if name not in slow)
     pyplot()
     restored = restore(checkpoint, device)
     if out.exists() and not out.is_dir():
@@ -411,8 +412,8 @@ def _draw_points(axes, points, usable, best, error: Callable[[Point], float], ma
         text = f"{number[id(point)]}" + (f" {point.setting.name}" if chosen and id(point) not in marked else "")
         near = sum(abs(log10(x) - a) < 0.1 and abs(log10(y) - b) < 0.15 for a, b in placed)
         placed.append((log10(x), log10(y)))
-        place = {"xytext": (5, 4 + 9 * near), "textcoords": "offset points", "fontsize": 8 if chosen else 7}
-        axes.annotate(text, (x, y), **place, color=color, zorder=4)
+        label = {"xytext": (5, 4 + 9 * near), "textcoords": "offset points", "fontsize": 8 if chosen else 7}
+        axes.annotate(text, (x, y), **label, color=color, zorder=4)
     axes.plot(
         *zip(*sorted((1e3 * p.step_seconds, error(p)) for p in best)), "-", color="#444444", linewidth=1, zorder=2
     )
@@ -427,14 +428,14 @@ def _draw_points(axes, points, usable, best, error: Callable[[Point], float], ma
 
 def _mark_presets(axes, presets: dict[str, Point], reference: Point, lost: Callable[[Point], float]) -> None:
     """A star on each preset, and a box that says what it is."""
-    for place, point in enumerate(sorted(set(presets.values()), key=lambda p: p.step_seconds)):
+    for index, point in enumerate(sorted(set(presets.values()), key=lambda p: p.step_seconds)):
         x, y = 1e3 * point.step_seconds, lost(point)
         axes.plot(x, y, "*", color="#e0a030", markersize=18, markeredgecolor="#444444", zorder=5)
         names = " = ".join(name for name, chosen in presets.items() if chosen is point)
         faster = reference.step_seconds / point.step_seconds
         text = "\n".join([f"{names}: {x:.3g} ms, {faster:.2f} times as fast", *wrap(point.setting.name, 36)])
         box = {"boxstyle": "round", "facecolor": "#fff8e8", "edgecolor": "#e0a030"}
-        at = {"xytext": (0.015 + 0.345 * place, 0.98), "textcoords": "axes fraction", "va": "top"}
+        at = {"xytext": (0.015 + 0.345 * index, 0.98), "textcoords": "axes fraction", "va": "top"}
         axes.annotate(text, (x, y), **at, fontsize=8.5, bbox=box, arrowprops={"arrowstyle": "-", "color": "#e0a030"})
 
 
@@ -456,14 +457,14 @@ def sections_figure(points: Sequence[Point]) -> bytes:
 
 
 def horizon_figure(points: Sequence[Point], case: BenchmarkCase, presets: dict[str, Point]) -> bytes:
-    """How the error against the film grows with the horizon: of the reference and the presets."""
+    """How the error against the video grows with the horizon: of the reference and the presets."""
     figure, axes = pyplot().subplots(figsize=(9.5, 4.5), layout="constrained")
     curves = {p.setting.name: p.by_step[case.metric] for p in (points[0], *presets.values())}
     curves["particles held still"] = case.constant[case.metric]
     for label, values in curves.items():
         known = [float("nan") if v is None else v for v in values]
         axes.plot(range(1, 1 + len(known)), known, "--" if label == "particles held still" else "-", label=label)
-    axes.set(xlabel="predicted step", ylabel="PSNR against the film [dB]")
+    axes.set(xlabel="predicted step", ylabel="PSNR against the video [dB]")
     axes.legend(fontsize=8)
     return _png(figure)
 

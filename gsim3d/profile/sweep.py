@@ -113,7 +113,7 @@ class Point:
         group, kind: of the setting.
         failure: why there is no result; "" where there is one.
         agreement: with the reference.
-        task: metric -> error against the film, the mean over steps of the mean over scenes.
+        task: metric -> error against the video, the mean over steps of the mean over scenes.
         by_step: metric -> its value at each step.
         encode, step: timings of the input's encoding, and of one simulated step and its images; one a round.
         once: seconds before the first step (capture of a graph).
@@ -203,8 +203,8 @@ class BenchmarkCase:
     Args:
         restored: the simulator.
         scenes: with the same cameras.
-        n_steps: to predict; default to the end of the shortest film.
-        metrics: of the error against the film, as :func:`gsim3d.evaluate.scoring.measurable` gives them.
+        n_steps: to predict; default to the end of the shortest video.
+        metrics: of the error against the video, as :func:`gsim3d.evaluate.scoring.measurable` gives them.
     Raises:
         InputError: scenes do not fit the model.
 
@@ -312,7 +312,7 @@ class BenchmarkCase:
         return _means(scores)[1]
 
     def compare(self, point: Point) -> None:
-        """Fills in how wrong ``point`` is, against the reference and against the film, or why it has no result."""
+        """Fills in how wrong ``point`` is, against the reference and against the video, or why it has no result."""
         cell = self.restored.simulator.config.dynamics.grid_size
         scores, differences, distances, resting = [], [], [], []
         try:

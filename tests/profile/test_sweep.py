@@ -1,4 +1,4 @@
-"""A sweep: errors against the reference and the film, failures, times in rounds, and going on after an end."""
+"""A sweep: errors against the reference and the video, failures, times in rounds, and going on after an end."""
 
 import dataclasses
 

@@ -7,7 +7,7 @@ others are the calls as Python makes them.
 
 The dynamics read the scene of which the authors' release was once recorded on an H200 (its own network code, spconv
 2.3.8, random weights, 129 input and 67 output channels, voxels of 4 mm): a ground disc and an ellipsoid that sinks 4 cm
-a step; masked means the ellipsoid alone. Encoder, rollouts and training see a film of it, with particles at their true
+a step; masked means the ellipsoid alone. Encoder, rollouts and training see a video of it, with particles at their true
 places (surface_scene.py).
 """
 

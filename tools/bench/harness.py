@@ -244,16 +244,7 @@ class Bench:
         file.parent.mkdir(exist_ok=True)
         file.write_text("".join(json.dumps(row) + "\n" for row in self.results))
 
-    def cost(
-        self,
-        case: str,
-        run,
-        plain,
-        *,
-        dtype: str = "float32",
-        tolerance: float | None = 0.0,
-        limit: float | None = None,
-    ) -> None:
+    def cost(self, case: str, run, plain, *, dtype="float32", tolerance: float | None = 0.0, limit=None) -> None:
         """What ``run`` costs over ``plain``, both sides in turns, one ahead and then the other; the cost is the median
         over pairs, between its quartiles. On the CPU of processor time on one thread, whatever else runs.
 

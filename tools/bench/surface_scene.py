@@ -1,6 +1,6 @@
 """The scene of the full-size benchmarks: an ellipsoid sinks 4 cm a step above a ground disc of 1.5 m radius.
 
-As points it is the scene of which the authors' release was recorded; as a film, 12 cameras around it see the body in a
+As points it is the scene of which the authors' release was recorded; as a video, 12 cameras around it see the body in a
 quarter of their pixels and the ground in all others. Masked means the body alone: 16k particles a step from 4 views of
 128 px, 6 mm apart, as the points are.
 

@@ -77,7 +77,7 @@ class SyntheticScene:
     height = width
 
 
-@functools.cache  # drawing the film takes longer than steps do
+@functools.cache  # drawing the video takes longer than steps do
 def synthetic_batch(n_scenes: int, size: int, masked: bool) -> tuple[Batch, torch.Tensor]:
     """A batch, and the places of the particles of its encoded steps."""
     generator = torch.Generator().manual_seed(0)
