@@ -66,8 +66,8 @@ img{max-width:100%}code{background:#f3f3f3;padding:2px 4px;white-space:pre-wrap}
 EXPLAINED = """\
 Time of one simulated step and its images at batch 1, median and 95th percentile. agreement and position (of moving
 particles, the largest, in cells) are against the reference run of the same checkpoint, the columns behind kept against
-the video. kept: share of the reference's gain over particles held still, in dB. A tie is a difference in time below what
-two measurements of one thing differ by. Bold: no other setting is both faster and nearer to the reference."""
+the video. kept: share of the reference's gain over particles held still, in dB. A tie is a difference in time below
+what two measurements of one thing differ by. Bold: no other setting is both faster and nearer to the reference."""
 
 
 # ---- the command ----
