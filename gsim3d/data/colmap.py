@@ -1,10 +1,8 @@
 """COLMAP's sparse models, text or binary: cameras and images, and points3D for the depth range.
 
-SCENE/sparse/0 (or sparse, colmap/sparse/0, or the scene itself) holds cameras, images and, if there are any, points3D,
-each .bin or .txt; SCENE/images/<name> the images. All models of cameras but FOV and thin prisms are read; images are
-undistorted. Optional: SCENE/scene.json with fps, near, far, origin, bounds. Without fps all images show one instant and
-each is a camera; with it the last number of a name is its time in frames and what is before it names the camera, as
-in <camera>/<number>.jpg. Lengths are in units of the model.
+All models of cameras but FOV and thin prisms are read. With fps in scene.json the last number of an image's name is its
+time in frames and the rest names its camera; without, each image is a camera of one instant. Lengths are in units of
+the model. All keys: docs/reference/data.md.
 """
 
 from __future__ import annotations

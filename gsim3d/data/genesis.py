@@ -1,10 +1,6 @@
-"""The published layout: metadata.json, and one PNG for each camera, step and image type.
+"""The published layout: metadata.json, and one PNG for each camera, step and image type (rgb, seg).
 
-metadata.json holds n_steps, n_cams, file_path_template (fields cam_ix, n_step, img_type; ".png" is appended)
-and for each camera cam_<j>: extrinsics (4x4, world-to-camera, OpenCV axes), intrinsics (3x3, pixels) and
-resolution [W, H]. Optional: fps, near, far (metres), origin, bounds; extrinsics and intrinsics of cameras that move
-are lists with one matrix a step. Image types: rgb; seg (0 background, 1 ground and fixed parts, 3 bodies that may
-move).
+Cameras are world-to-camera with OpenCV axes, and of one matrix a step where they move. All keys: docs/reference/data.md.
 """
 
 from __future__ import annotations

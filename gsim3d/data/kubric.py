@@ -1,11 +1,7 @@
 """Kubric's output and the MOVi layout made of it: one folder for each camera, each with its own metadata.json.
 
-SCENE/cam_<j>/metadata.json: ``camera`` with positions [P, 3] and quaternions [P, 4] (w, x, y, z) of a camera with
-Blender's axes (x right, y up, z backwards), and K (normalised, Kubric's signs) or focal_length and sensor_width;
-``metadata`` with resolution [W, H] or width and height, and frame_rate. Frames: rgba/rgba_<t>.png and
-segmentation/segmentation_<t>.png, or without those folders, as Kubric itself writes them; the number in the file name
-is the number of the pose. What segmentation marks may move; the rest is fixed, and background where alpha is 0.
-A folder with such a metadata.json and frames of its own is a scene of one camera.
+Cameras have Blender's axes (x right, y up, z backwards); the number in a file name is the number of the pose. What the
+segmentation marks may move; the rest is fixed, and background where alpha is 0. All keys: docs/reference/data.md.
 """
 
 from __future__ import annotations

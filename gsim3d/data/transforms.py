@@ -1,14 +1,7 @@
 """Nerfstudio's transforms.json, with a time for every frame and any number of cameras; and NeRF-synthetic's splits.
 
-Keys of the file, or of single frames, which win: fl_x, fl_y, cx, cy, or camera_angle_x, camera_angle_y (radians), w, h
-(default: of the images), and the lens: camera_model, is_fisheye, k1 to k6, p1, p2 (see :mod:`gsim3d.data.lenses`).
-Each of ``frames``: file_path; transform_matrix, camera-to-world with OpenGL's axes (x right, y up, z backwards); time
-in seconds (any unit where fps is given); camera, its name; mask_path, an image that is not 0 on bodies that may move;
-or label_path, one with 0 background, 1 fixed parts, 3 bodies that may move; without either, alpha above half may move.
-Without ``camera`` the path decides: frames whose paths differ in their last number only come from one camera. Without
-any ``time`` all show one instant and each has its own camera. Beside them: fps, near, far, origin, bounds.
-
-Without transforms.json, transforms_train.json, transforms_val.json and transforms_test.json are one scene.
+Keys of the file are those of every frame that does not have them itself. Frames without ``camera`` are of one camera
+where their paths differ only in the last number. All keys: docs/reference/data.md.
 """
 
 from __future__ import annotations

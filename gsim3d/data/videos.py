@@ -1,18 +1,8 @@
-"""A plain folder: for each camera one video file or one folder of frames, and cameras.json.
+"""Videos: cameras.json, and for each camera one video file or one folder of numbered frames.
 
-cameras.json holds ``cameras``, a list of objects with name; size [W, H]; K (3x3, pixels); R (3x3) and T (3),
-world-to-camera with OpenCV's axes; optional distortion, OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]] (dist_k1k2p1p2k3 is the
-same), or the lens keys of :mod:`gsim3d.data.lenses`. Of a camera that moves K, R and T may be lists with one entry a
-step. Optional beside ``cameras``: fps (needed for folders of frames), resample, near, far, origin, bounds; units of T
-and of those (m, cm or mm); pixel_center, the coordinate of the first pixel's centre in K: 0.5, or 0 as in OpenCV's
-calibration; masks: "subtract" or "none".
-
-Frames lie in <name>/<number>.png (.jpg, .webp, .tif), or in <name>.mp4 (.mkv, .webm, .mov, .avi). Frame number n was
-taken at n / fps seconds, that of a video at the time that the file has for it; cameras are aligned by time. A video
-whose frames are not evenly spaced needs resample, steps a second: the nearest frame of each camera is taken. Labels,
-where there are any: masks/<name>/<number>.png, not 0 on bodies that may move, or labels/<name>/<number>.png with 0
-background, 1 fixed parts, 3 bodies that may move (frames of a video count from 0). Without them alpha above half may
-move, and without alpha the background of cameras that stand still is subtracted, unless masks is "none".
+Cameras are aligned by time: frame number n of a folder was taken at n / fps seconds, that of a video at its time stamp.
+Labels come from the folders labels or masks, else from alpha, else from subtraction of a still background. All keys:
+docs/reference/data.md.
 """
 
 from __future__ import annotations
