@@ -1,6 +1,7 @@
 """The published layout: metadata.json, and one PNG for each camera, step and image type (rgb, seg).
 
-Cameras are world-to-camera with OpenCV axes, and of one matrix a step where they move. All keys: docs/reference/data.md.
+Cameras are world-to-camera with OpenCV axes, with one matrix a step where they move. All keys:
+docs/reference/data.md.
 """
 
 from __future__ import annotations
