@@ -145,6 +145,6 @@ def test_autograd_graph_is_hooked_once(simulator):
     bad = torch.where(torch.arange(len(means))[:, None] == 1, NAN, means)
     for _ in range(2):
         validate_particles(dataclasses.replace(state, means=bad), StabilityConfig("drop"), StabilityReport(), "here")
-    assert "gsim3d.watched" in means.grad_fn.metadata
+    assert "gsim3d.validated" in means.grad_fn.metadata
     (grad,) = torch.autograd.grad(bad[2:].sum(), leaf)
     assert bool(grad.isfinite().all())
