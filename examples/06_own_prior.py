@@ -15,15 +15,12 @@ from gsim3d.priors import Prior, PriorConfig
 
 @dataclass(frozen=True)
 class WindConfig(PriorConfig):
-    type: str = "wind"
+    type = "wind"
     velocity: tuple[float, float, float] = (0.02, 0.0, 0.0)  # metres a step
     drag: float = 0.1  # share of the difference to the wind that a step takes away, at first
 
-    def build(self):
-        return Wind(self)
 
-
-class Wind(Prior):
+class Wind(Prior, config=WindConfig):
     requires = ("inertia",)  # which knows velocities, and comes before
 
     def __init__(self, config):

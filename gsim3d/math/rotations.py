@@ -78,5 +78,4 @@ def rotate_left(quats: Tensor, rotation_vectors: Tensor) -> Tensor:
     quats = unit_quats(quats)
     qw, qv = quats[:, :1], quats[:, 1:]
     turned = torch.cat([w * qw - (v * qv).sum(1, keepdim=True), w * qv + qw * v + torch.linalg.cross(v, qv)], 1)
-    largest = turned.detach().gather(1, turned.detach().abs().argmax(1, keepdim=True))
-    return torch.where(largest < 0, -turned, turned)
+    return with_positive_largest(turned)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from gsim3d.cameras import Frames
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, check_ranges
 from gsim3d.nn.layers import RowLinear
 from gsim3d.nn.point_transformer import STEM_KERNEL, SparseConv
 from gsim3d.priors.movable import Movable, Windows
@@ -21,7 +21,8 @@ MAX_GAIN = 2.0  # a gain is within plus and minus this
 
 @dataclass(frozen=True)
 class PriorConfig:
-    """Settings of a prior. A subclass defines a ``type``, by which lists in YAML name it, and :meth:`build`.
+    """Settings of a prior. A subclass defines its ``type``, by which lists in YAML name it; a subclass of
+    :class:`Prior` that names it is what :meth:`build` makes.
 
     Attributes:
         type: of the prior, which is also its name in a model.
@@ -32,22 +33,26 @@ class PriorConfig:
     version: int = 1
 
     VARIANTS: ClassVar[dict] = {}
+    RANGES: ClassVar[dict] = {}  # of settings, both ends included
+    PRIOR: ClassVar[Any] = None
 
     def __init_subclass__(cls, **kwargs):
         super().__init_subclass__(**kwargs)
         PriorConfig.VARIANTS[cls.type] = cls
 
     def __post_init__(self):
-        fixed = type(self)
-        if (self.type, self.version) != (fixed.type, fixed.version):
+        known = type(self)
+        if (self.type or known.type, self.version) != (known.type, known.version):
             raise InputError(
-                f"prior {fixed.type}: this version of gsim3d has type {fixed.type!r}, version {fixed.version}; "
+                f"prior {known.type}: this version of gsim3d has type {known.type!r}, version {known.version}; "
                 f"got {self.type!r}, version {self.version}"
             )
+        object.__setattr__(self, "type", known.type)
+        check_ranges(self, **known.RANGES)
 
     def build(self) -> Prior:
         """The module with these settings and its first weights."""
-        raise NotImplementedError
+        return self.PRIOR(self)
 
 
 @dataclass(frozen=True)
@@ -176,6 +181,11 @@ class Prior(nn.Module):
     n_conv_features = n_features = n_gains = 0
     gains_change = "means"
     replaces_displacement = latent_only = reads_background = False
+
+    def __init_subclass__(cls, config: type[PriorConfig] | None = None, **kwargs):
+        super().__init_subclass__(**kwargs)
+        if config is not None:
+            config.PRIOR = cls
 
     def __init__(self, config: PriorConfig):
         super().__init__()

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from gsim3d.errors import check_ranges
 from gsim3d.priors.base import Motion, Prior, PriorConfig, StepContext
 from gsim3d.priors.movable import Windows
 from gsim3d.priors.proximity import ContactGeometry
@@ -31,7 +30,7 @@ class ContactConfig(PriorConfig):
         min_speed: metres a step along a surface; slower particles are held.
     """
 
-    type: str = "contact"
+    type = "contact"
     friction: float = 1.0
     offset: float = 0.02
     offset_unit: float = 0.1
@@ -43,17 +42,20 @@ class ContactConfig(PriorConfig):
     max_scale: float = 50.0
     min_speed: float = 1e-6
 
-    def __post_init__(self):
-        super().__post_init__()
-        check_ranges(self, friction=(0, 1e6), offset=(-1e6, 1e6), offset_unit=(1e-9, 1e6), radius=(1e-6, 1e6))
-        check_ranges(self, exponent=(0, 100), min_opacity=(0, 1), iterations=(1, 100), max_scale=(1, 1e6))
-        check_ranges(self, min_speed=(1e-12, 1e6))
+    RANGES = {
+        "friction": (0, 1e6),
+        "offset": (-1e6, 1e6),
+        "offset_unit": (1e-9, 1e6),
+        "radius": (1e-6, 1e6),
+        "exponent": (0, 100),
+        "min_opacity": (0, 1),
+        "iterations": (1, 100),
+        "max_scale": (1, 1e6),
+        "min_speed": (1e-12, 1e6),
+    }
 
-    def build(self) -> Contact:
-        return Contact(self)
 
-
-class Contact(Prior):
+class Contact(Prior, config=ContactConfig):
     """Let h be the height of a particle over the plane of the background near it, n its normal, d its displacement. The
     normal component is clamped, d_n >= -max(h - offset, 0); the tangential part shrinks by at most friction times what
     the normal part lost. If ``rigid``, these corrections are projected on the rigid motions of the body.

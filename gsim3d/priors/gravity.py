@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
-from gsim3d.errors import InputError, check_ranges
+from gsim3d.errors import InputError
 from gsim3d.priors.base import Motion, Prior, PriorConfig, StepContext
 
 
@@ -23,25 +23,28 @@ class GravityConfig(PriorConfig):
         touch: mean of that in a window, from which on its particles touch in full.
     """
 
-    type: str = "gravity"
+    type = "gravity"
     acceleration: tuple[float, float, float] = (0.0, 0.0, -0.005)
     unit: float = 0.01
     radius: float = 0.3
     exponent: float = 4
     touch: float = 0.02
 
+    RANGES = {
+        "acceleration": (-1e6, 1e6),
+        "unit": (1e-9, 1e6),
+        "radius": (1e-6, 1e6),
+        "exponent": (0, 100),
+        "touch": (1e-6, 1),
+    }
+
     def __post_init__(self):
         super().__post_init__()
         if len(self.acceleration) != 3:
             raise InputError(f"gravity: acceleration must be three numbers; got {list(self.acceleration)}")
-        check_ranges(self, acceleration=(-1e6, 1e6), unit=(1e-9, 1e6), radius=(1e-6, 1e6), exponent=(0, 100))
-        check_ranges(self, touch=(1e-6, 1))
-
-    def build(self) -> Gravity:
-        return Gravity(self)
 
 
-class Gravity(Prior):
+class Gravity(Prior, config=GravityConfig):
     """The inertial displacement grows by the acceleration in every step. With t from 0 for bodies in flight to 1 for
     those that touch the background anywhere, what is predicted counts t times: flight is ballistic, and a contact
     changes how the whole body moves.

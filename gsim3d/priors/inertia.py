@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gsim3d.errors import check_ranges
 from gsim3d.math.rotations import rotate_left
 from gsim3d.priors.base import Motion, Prior, PriorConfig, StepContext, bounded_gains
 from gsim3d.priors.movable import Windows
@@ -24,19 +23,14 @@ class InertiaConfig(PriorConfig):
         rotate_appearance: whether what is drawn turns with the particles around it. Needs a latent model.
     """
 
-    type: str = "inertia"
+    type = "inertia"
     radius: float = 0.3
     rotate_appearance: bool = False
 
-    def __post_init__(self):
-        super().__post_init__()
-        check_ranges(self, radius=(1e-6, 1e6))
-
-    def build(self) -> Inertia:
-        return Inertia(self)
+    RANGES = {"radius": (1e-6, 1e6)}
 
 
-class Inertia(Prior):
+class Inertia(Prior, config=InertiaConfig):
     """Let V be three displacements a step of each particle: of the window around it, of the rigid motion of that window
     if it goes on and turns as one body, and its own last one. The inertial displacement is V_2, and predicted gains
     g [3, 3] add sum_k g_k V_k along each axis. What a contact did to some particles of a body in the last step is part

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from gsim3d.cameras import Frames
-from gsim3d.errors import InputError, check_ranges
+from gsim3d.errors import InputError
 from gsim3d.priors.base import Prior, PriorConfig, StepContext, bounded
 from gsim3d.priors.movable import Movable
 from gsim3d.priors.padding import LEAST_LOGIT, Compact, Samples, from_blocks, gaussian, in_blocks, squared_distances
@@ -44,7 +44,7 @@ class DirectionalLightConfig(PriorConfig):
         max_gain: limit of the logarithm of what is predicted besides.
     """
 
-    type: str = "directional_light"
+    type = "directional_light"
     directions: tuple[tuple[float, float, float], ...] = ((0.0, 0.0, 1.0),)
     shading: Literal["lambert", "occlusion"] = "lambert"
     strength: float = 2.0
@@ -53,14 +53,21 @@ class DirectionalLightConfig(PriorConfig):
     min_opacity: float = 0.3
     max_gain: float = 2.0
 
+    RANGES = {
+        "directions": (-1e6, 1e6),
+        "strength": (0, 1e6),
+        "unit": (1e-6, 1e6),
+        "beam": (1e-3, 1e3),
+        "min_opacity": (0, 1),
+        "max_gain": (0, 100),
+    }
+
     def __post_init__(self):
         super().__post_init__()
         if not self.directions or any(len(light) != 3 or not any(light) for light in self.directions):
             raise InputError(f"directional_light: directions must be vectors (x, y, z); got {self.directions}")
         if self.shading not in ("lambert", "occlusion"):
             raise InputError(f'directional_light: shading must be "lambert" or "occlusion"; got {self.shading!r}')
-        check_ranges(self, directions=(-1e6, 1e6), strength=(0, 1e6), unit=(1e-6, 1e6), beam=(1e-3, 1e3))
-        check_ranges(self, min_opacity=(0, 1), max_gain=(0, 100))
 
     def build(self) -> _Light:
         return LambertianLight(self) if self.shading == "lambert" else OcclusionLight(self)

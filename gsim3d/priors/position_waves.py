@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsim3d.errors import check_ranges
 from gsim3d.priors.base import Prior, PriorConfig, StepContext
 from gsim3d.state import Particles
 
@@ -24,19 +23,14 @@ class PositionWavesConfig(PriorConfig):
         longest: metres, wavelength of the first.
     """
 
-    type: str = "position_waves"
+    type = "position_waves"
     count: int = 4
     longest: float = 4.0
 
-    def __post_init__(self):
-        super().__post_init__()
-        check_ranges(self, count=(1, MOST_WAVES), longest=(1e-6, 1e6))
-
-    def build(self) -> PositionWaves:
-        return PositionWaves(self)
+    RANGES = {"count": (1, MOST_WAVES), "longest": (1e-6, 1e6)}
 
 
-class PositionWaves(Prior):
+class PositionWaves(Prior, config=PositionWavesConfig):
     """Features sin(2 pi 2^k x / longest), cos(2 pi 2^k x / longest) for k = 0 .. count - 1."""
 
     def __init__(self, config: PositionWavesConfig):

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsim3d.errors import check_ranges
 from gsim3d.priors.base import Prior, PriorConfig, StepContext
 from gsim3d.priors.movable import Movable
 from gsim3d.priors.padding import LEAST_LOGIT, from_blocks, in_blocks, squared_distances, weights
@@ -26,20 +25,15 @@ class ProximityConfig(PriorConfig):
             those that the background leaves in the air where it was hidden less than 0.5.
     """
 
-    type: str = "proximity"
+    type = "proximity"
     range: float = 0.15
     window: float = 0.5
     min_opacity: float = 0.1
 
-    def __post_init__(self):
-        super().__post_init__()
-        check_ranges(self, range=(1e-6, 1e6), window=(1e-3, 1e3), min_opacity=(0, 1))
-
-    def build(self) -> Proximity:
-        return Proximity(self)
+    RANGES = {"range": (1e-6, 1e6), "window": (1e-3, 1e3), "min_opacity": (0, 1)}
 
 
-class Proximity(Prior):
+class Proximity(Prior, config=ProximityConfig):
     """Features p u and p for each movable particle: u is the way to the background in units of the range, and
     ``p = exp(-|u|^2 / 2)`` the proximity. No gradients."""
 

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from gsim3d.cameras import Frames
-from gsim3d.errors import check_ranges
 from gsim3d.priors.base import Prior, PriorConfig, StepContext
 from gsim3d.priors.movable import Movable
 from gsim3d.priors.padding import SAMPLES, squared_distances
@@ -27,20 +26,15 @@ class SegmentationConfig(PriorConfig):
         neck: share of a cluster's particles that may be within reach of another one without both being one body.
     """
 
-    type: str = "segmentation"
+    type = "segmentation"
     neighbors: int = 8
     min_share: float = 0.1
     neck: float = 0.1
 
-    def __post_init__(self):
-        super().__post_init__()
-        check_ranges(self, neighbors=(1, SAMPLES), min_share=(0, 1), neck=(0, 1))
-
-    def build(self) -> Segmentation:
-        return Segmentation(self)
+    RANGES = {"neighbors": (1, SAMPLES), "min_share": (0, 1), "neck": (0, 1)}
 
 
-class Segmentation(Prior):
+class Segmentation(Prior, config=SegmentationConfig):
     """Gives encoded particles their ``body``."""
 
     def initialize(self, particles: Particles, ctx: StepContext, frames: Frames | None = None) -> Particles:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gsim3d.errors import check_ranges
 from gsim3d.priors.base import Motion, Prior, PriorConfig, StepContext, bounded_gains
 from gsim3d.priors.movable import Windows
 from gsim3d.priors.rigid import best_rotation
@@ -25,20 +24,15 @@ class ShapeMatchingConfig(PriorConfig):
             is learned wrongly over many steps.
     """
 
-    type: str = "shape_matching"
+    type = "shape_matching"
     radius: float = 0.3
     stiffness: float = 1.2
     position_gradients: bool = True
 
-    def __post_init__(self):
-        super().__post_init__()
-        check_ranges(self, radius=(1e-6, 1e6), stiffness=(0, 100))
-
-    def build(self) -> ShapeMatching:
-        return ShapeMatching(self)
+    RANGES = {"radius": (1e-6, 1e6), "stiffness": (0, 100)}
 
 
-class ShapeMatching(Prior):
+class ShapeMatching(Prior, config=ShapeMatchingConfig):
     """Let w be the way from a particle to where it would be if the window around it had only moved and turned since the
     start. The elastic displacement is (stiffness + g) w, with predicted gains g along each axis.
 

@@ -9,7 +9,6 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from gsim3d.cameras import Frames
-from gsim3d.errors import check_ranges
 from gsim3d.priors.base import Prior, PriorConfig, StepContext
 from gsim3d.priors.movable import Windows
 from gsim3d.priors.padding import PaddedClouds, Samples, Subset, squared_distances, weights
@@ -37,22 +36,17 @@ class VelocityFromImagesConfig(PriorConfig):
         inside: metres: particles are encoded so far below the surface that images show, which turns on a larger circle.
     """
 
-    type: str = "velocity_from_images"
+    type = "velocity_from_images"
     radius: float = 0.3
     blur: float = 1.0
     facing: float = 0.6
     robust: float = 0.02
     inside: float = 0.02
 
-    def __post_init__(self):
-        super().__post_init__()
-        check_ranges(self, radius=(1e-6, 1e6), blur=(1e-3, 100), facing=(-1, 1), robust=(1e-6, 10), inside=(0, 1e6))
-
-    def build(self) -> VelocityFromImages:
-        return VelocityFromImages(self)
+    RANGES = {"radius": (1e-6, 1e6), "blur": (1e-3, 100), "facing": (-1, 1), "robust": (1e-6, 10), "inside": (0, 1e6)}
 
 
-class VelocityFromImages(Prior):
+class VelocityFromImages(Prior, config=VelocityFromImagesConfig):
     """Gives encoded particles their ``velocity``: of the newest cloud the mean displacement a step since the oldest of
     its history or, in a model with gravity, that of the last step; 0 for others.
 
