@@ -1,7 +1,7 @@
 """Particles and Gaussians: the state of a simulation.
 
-Both are ragged: rows of many clouds (a cloud is one scene at one time step) are packed one after another, and
-``cu_rows`` says where each cloud starts. Sizes: B scenes, Q clouds, I images, N rows, C channels, H W pixels.
+Both are ragged: particles of many clouds (a cloud is one scene at one time step) are packed one after another, and
+``cu_rows`` holds where each cloud starts. Sizes: B scenes, Q clouds, I images, N particles, C channels, H W pixels.
 Units are metres and pixels; axes are OpenCV's (x right, y down, z forward); quaternions are (w, x, y, z).
 """
 
@@ -64,7 +64,7 @@ class CloudTable:
     Attributes:
         starts: Q + 1 row numbers.
         scenes, steps: Q numbers.
-        tensors: the three on the device of the rows.
+        tensors: the three on the device of the particles.
     """
 
     starts: tuple[int, ...]
@@ -84,7 +84,7 @@ class CloudTable:
     def make(
         cls, counts: Iterable[int], scenes: Iterable[int], steps: Iterable[int], device: torch.device
     ) -> CloudTable:
-        """``counts``: rows of each cloud."""
+        """``counts``: particles of each cloud."""
         numbers = tuple(accumulate(counts, initial=0)), tuple(scenes), tuple(steps)
         return cls(*numbers, tuple(constant(values, device) for values in numbers))
 
@@ -146,7 +146,7 @@ class Attribute:
         default: value of particle sets without the attribute: a number, "identity", or the attribute that it begins as;
             None: every particle set has it, or no other may stand in for it.
         predicted: whether a step may change it.
-        validated: whether the guards of a step look at it; others are checked once, at the start.
+        validated: whether the guards of a step check it; others are checked once, at the start.
         dtype: other than that of the network.
     """
 
@@ -293,18 +293,18 @@ class Particles(TensorRecord):
         return torch.cat([self.dynamic_latents, self.static_latents], 1)
 
     def row_fields(self) -> dict[str, Tensor]:
-        """The tensors that have one row a particle, by name."""
+        """The tensors that have one entry a particle, by name."""
         return {name: value for name in self.ROW_FIELDS if (value := getattr(self, name)) is not None}
 
     def row_cloud(self) -> Tensor:
-        """int64 [N], the cloud of each row."""
+        """int64 [N], the cloud of each particle."""
         counts = self.cu_rows[1:] - self.cu_rows[:-1]
         return torch.repeat_interleave(
             torch.arange(self.n_clouds, device=counts.device), counts, output_size=self.n_rows
         )
 
     def row_offset(self) -> Tensor | None:
-        """float64 [N, 3], the ``world_offset`` of each row's scene."""
+        """float64 [N, 3], the ``world_offset`` of each particle's scene."""
         return None if self.world_offset is None else self.world_offset[self.cloud_scene[self.row_cloud()]]
 
     def select_rows(self, rows: Tensor) -> Particles:
@@ -378,7 +378,7 @@ def with_attribute(particles: Particles, name: str, width: int = 3) -> Particles
     if attribute.default == "identity":
         one = means.new_ones(particles.n_rows, 1)
         value = F.pad(one, (0, 3)) if attribute.kind == "quaternion" else torch.diag_embed(one.expand(-1, 3))
-    elif isinstance(attribute.default, str):  # guards put broken particles to sleep, and do not look at copies
+    elif isinstance(attribute.default, str):  # guards put broken particles to sleep, and do not check copies
         value = getattr(particles, attribute.default)
         value = (value.detach() if attribute.kind == "point" else value).nan_to_num(0, 0, 0)
     else:

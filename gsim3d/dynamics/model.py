@@ -110,8 +110,8 @@ class Dynamics(nn.Module):
             self._most_movable = before
 
     def room(self, history: Particles) -> int:
-        """Rows that the network needs room for in calls like that of ``history``: with a relightable background only
-        those that it sees, which waits for the device."""
+        """The capacity that calls like that of ``history`` need, in particles: with a relightable background of those
+        that the network sees, which waits for the device."""
         if not self.config.is_relightable:
             return history.n_rows
         return min(history.n_rows, math.ceil(SLACK * int(self._seen(history).sum())))
@@ -275,7 +275,7 @@ class Dynamics(nn.Module):
         return torch.Generator(device).manual_seed(seed)
 
     def _seen(self, history: Particles) -> Tensor:
-        """bool [N], rows that the network sees."""
+        """bool [N], particles that the network sees."""
         seen = history.activity != ASLEEP
         if self.config.is_relightable:
             runs = history.clouds.row_runs(newest_clouds(history.clouds))
@@ -284,7 +284,7 @@ class Dynamics(nn.Module):
         return seen
 
     def _rounds(self, history: Particles) -> bool:
-        """Whether the network sees rows that are none, so that its matrix products have few sizes: cuBLAS chooses an
+        """Whether the network sees padding, so that its matrix products have few sizes: cuBLAS chooses an
         algorithm on the host for every new one, and clouds that move have new ones at each step."""
         if torch.compiler.is_compiling():
             return False
@@ -336,7 +336,7 @@ def _later(particles: Particles, n_steps: int) -> Particles:
 
 
 def _seen_first(seen: Tensor, cu_rows: Tensor, n_rows: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """``n_rows`` rows, those that are ``seen`` first: int64 [n_rows] which, where clouds begin among them (the last one
+    """``n_rows`` particles, ``seen`` ones first: int64 [n_rows] which, where clouds begin among them (the last one
     ends with all), bool [n_rows] whether they are seen, and how many are seen in all. Waits for nothing."""
     until = F.pad(seen.cumsum(0), (1, 0))
     rows = torch.sort((~seen).to(torch.uint8), stable=True).indices[:n_rows]

@@ -1,4 +1,4 @@
-"""A history in two parts: the rows that a call of the network advances, and those that rest meanwhile."""
+"""A history in two parts: the particles that a call of the network advances, and those that rest meanwhile."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ class Partition:
     """What moves and what rests. Scenes in which nothing moves are in neither part.
 
     Attributes:
-        newest: the last cloud of every scene, with all its rows.
-        moving: all clouds, the rows that move.
-        background: the rows of the newest clouds that rest and are seen; None where the network does not tell them
+        newest: the last cloud of every scene, with all its particles.
+        moving: all clouds, the particles that move.
+        background: the particles of the newest clouds that rest and are seen; None where the network does not tell them
             apart.
-        rows: int64, the rows of ``newest`` that the newest clouds of ``moving`` hold.
+        rows: int64, the particles of ``newest`` that the newest clouds of ``moving`` hold.
     """
 
     newest: Particles
@@ -29,13 +29,14 @@ class Partition:
 
     @classmethod
     def of(cls, history: Particles, *, asymmetric: bool, asleep: Tensor | None = None) -> Partition:
-        """Waits for the device, to count rows.
+        """Waits for the device, to count particles.
 
         Args:
             history: clouds sorted by (scene, step).
-            asymmetric: frozen rows rest, and what rests is a background; else frozen rows move with the others (their
-                latents do), and only whole scenes may be asleep.
-            asleep: bool, rows of the newest clouds that rest as well. The clouds of a scene then have the same rows.
+            asymmetric: frozen particles rest, and what rests is a background; else frozen particles move with the
+                others (their latents do), and only whole scenes may be asleep.
+            asleep: bool, particles of the newest clouds that rest as well. All clouds of a scene then have the same
+                particles.
         """
         newest, background = last_steps(history, 1), None
         if not asymmetric and asleep is None:
@@ -56,7 +57,7 @@ class Partition:
         return self.moving.n_clouds == 0
 
     def whole(self, step: Particles | None, ahead: int) -> Particles:
-        """All rows of every scene ``ahead`` steps after the newest; ``step``: those that move, None where none do."""
+        """All particles of every scene ``ahead`` steps after the newest; ``step``: moving ones, None for none."""
         table = self.newest.clouds
         counts = [table.count(q) for q in range(len(table))]
         later = CloudTable.make(counts, table.scenes, (s + ahead for s in table.steps), self.newest.cu_rows.device)
@@ -71,7 +72,7 @@ class Partition:
 
 
 def _awake(moving: Particles) -> Particles:
-    """The clouds of scenes whose newest one has rows."""
+    """The clouds of scenes whose newest one has particles."""
     table = moving.clouds
     awake = {table.scenes[q] for q in newest_clouds(table) if table.count(q) > 0}
     kept = [q for q, scene in enumerate(table.scenes) if scene in awake]

@@ -21,7 +21,7 @@ def rollout(
         n_steps: how many steps to predict.
         max_steps: how many steps of each scene ``predict`` is given at most.
     Returns:
-        One Particles a step, one cloud a scene each; rows are those of the newest step of ``history`` throughout.
+        One Particles a step, one cloud a scene each; particles are those of the newest step of ``history`` throughout.
     """
     history, steps = last_steps(history, max_steps), []
     while len(steps) < n_steps:

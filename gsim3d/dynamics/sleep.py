@@ -1,14 +1,14 @@
-"""Rows that came to rest are not computed until something near them moves.
+"""Particles that came to rest are not computed until something near them moves.
 
-A row is quiet after ``patience`` steps in which it changed by no more than ``eps``. By the policy "exact" a scene
-sleeps once all its rows are quiet: scenes do not see each other. By "approx" space is cut into cubes with edges of
-``halo`` metres. A cube sleeps while no row that is restless is in it or in one of its 26 neighbours, or will be in the
-next step if it moves on as in the last; else it wakes at once. A row that moves by less than ``halo`` a step, or
-steadily, meets no sleeping row. Which rows fall asleep is decided every ``patience`` steps only, since other sleepers
-make another background. Sleeping rows are a background to the others, so "approx" needs a model of
+A particle is quiet after ``patience`` steps in which it changed by no more than ``eps``. By the policy "exact" a scene
+sleeps once all its particles are quiet: scenes do not see each other. By "approx" space is cut into cubes with edges of
+``halo`` metres. A cube sleeps while no restless particle is in it or in one of its 26 neighbours, or will be in the
+next step if it moves on as in the last; else it wakes at once. A particle that moves by less than ``halo`` a step, or
+steadily, meets no sleeping particle. Which particles fall asleep is decided every ``patience`` steps only, since other
+sleepers make another background. Sleeping particles are a background to the others, so "approx" needs a model of
 ``background="asymmetric"``.
 
-A row that sleeps misses changes of up to ``eps`` a step. Where a simulation that never sleeps would change no row of a
+A particle that sleeps misses changes of up to ``eps`` a step. Where a simulation without sleep would change none of a
 sleeping scene by more, the two differ by at most ``eps`` times the steps slept; with ``eps=0`` by nothing, for then the
 network was shown the same state in all steps of its history and changed nothing.
 """
@@ -34,7 +34,7 @@ class RestLog:
 
     Attributes:
         n_rows: of the newest clouds, all scenes.
-        moving: for each step, rows that were computed.
+        moving: for each step, particles that were computed.
         remembered: how often a background was computed.
         calls: of the network, over what moves.
     """
@@ -46,7 +46,7 @@ class RestLog:
 
     @property
     def resting_share(self) -> float:
-        """Of all rows and steps."""
+        """Of all particles and steps."""
         total = self.n_rows * len(self.moving)
         return 1 - sum(self.moving) / total if total else 0.0
 
@@ -55,10 +55,10 @@ class Sleepers:
     """Who sleeps, from one step to the next.
 
     Args:
-        rule: when rows sleep.
-        newest: one cloud a scene, the rows that are looked after; all are awake.
+        rule: when particles sleep.
+        newest: one cloud a scene, the particles that may sleep; all are awake.
         grid_size: metres, edge of a cell.
-        history: steps that the model sees: who falls asleep has been the same in all of them.
+        history: steps that the model sees: what falls asleep has been the same in all of them.
         changing: fields that a step may change; None: all but those that no model predicts.
     """
 
@@ -84,7 +84,7 @@ class Sleepers:
         self.n_steps += 1
         moved = (
             after.activity != before.activity
-        ) > self.rule.eps  # who vanishes from the sight of others changed by 1
+        ) > self.rule.eps  # what vanishes from the sight of others changed by 1
         for name in sorted(self.changing):
             allowed = self.reach if name == "means" else self.rule.eps
             moved |= _largest(getattr(after, name) - getattr(before, name)) > allowed
@@ -112,19 +112,19 @@ class Sleepers:
 
 
 def _largest(change: Tensor) -> Tensor:
-    """[N] of [N, ...], the largest size in each row."""
+    """[N] of [N, ...], the largest size in each particle."""
     return change.abs().flatten(1).amax(1) if change.dim() > 1 else change.abs()
 
 
 def _cubes(places: Tensor, origin: Tensor, scene: Tensor, edge: float) -> Tensor:
-    """int64 [N], the scene and cube of every row as one number."""
+    """int64 [N], the scene and cube of every particle as one number."""
     cubes = torch.floor((places.double() - origin[scene]) / edge).nan_to_num()
     cubes = cubes.clamp(1, 2**CUBE_BITS - 2).long()  # a cube further out would have neighbours elsewhere
     return (torch.cat([scene[:, None], cubes], 1) * constant(WEIGHTS, scene.device)).sum(1)
 
 
 def _near(cubes: Tensor, stirred: Tensor) -> Tensor:
-    """bool [N]: rows whose cube is one of ``stirred`` or a neighbour of it."""
+    """bool [N]: particles whose cube is one of ``stirred`` or a neighbour of it."""
     steps = torch.arange(-1, 2, device=cubes.device)
     offsets = torch.cartesian_prod(steps, steps, steps) @ constant(WEIGHTS, cubes.device)[1:]
     return torch.isin(cubes, torch.unique(stirred)[:, None] + offsets)

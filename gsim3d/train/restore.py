@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from gsim3d import presets
-from gsim3d.compat.checkpoints import current_model
+from gsim3d.compat.checkpoints import SWITCHES, current_model
 from gsim3d.compat.released_model import ReleasedModelConfig, ReleasedSimulator, simulator_class
 from gsim3d.data import Scene
 from gsim3d.data.fitting import frame_stride
@@ -153,6 +153,11 @@ def model_config(config: TrainConfig) -> ModelConfig:
         raise InputError(
             f"preset: must be one of {', '.join(PRESETS)}; got {shown(config.preset)}"
             f"{did_you_mean(config.preset, PRESETS)}"
+        )
+    dynamics = config.model.get("dynamics")
+    if isinstance(dynamics, dict) and (old := [name for name in dynamics if name in SWITCHES]):
+        raise InputError(
+            f"model.dynamics.{old[0]}: physics is the list model.dynamics.priors now, as in configs/priors/elastic.yaml"
         )
     base = getattr(presets, config.preset)()
     return from_dict(ModelConfig, config.model, "model", base)

@@ -110,6 +110,7 @@ def test_every_number_of_a_run_has_a_finite_range(tmp_path, text):
             {"dynamics": {"priors": [{"type": "gravity", "acceleration": [0, 0, float("nan")]}]}},
             r"model.dynamics.priors\[0\].acceleration\[2\]: must be a number",
         ),
+        ({"dynamics": {"motion_length": 0.3}}, "model.dynamics.motion_length: physics is the list"),
         ({"dynamics": {"priors": [{"type": "wind"}]}}, r"model.dynamics.priors\[0\].type: must be one of"),
         ({"stability": {"max_speed": 1e39}}, "model.stability.max_speed: must be a number"),
         ({"encoder": {"n_depths": 2**70}}, "model.encoder.n_depths: must be a whole number"),
