@@ -14,6 +14,7 @@ from gsim3d.compat.released_config import read_config
 from gsim3d.compat.released_import import published_shapes
 from gsim3d.compat.released_model import ReleasedAttention, as_released
 from gsim3d.dynamics import Dynamics
+from gsim3d.effects.spec import EffectsSpec
 from gsim3d.nn.multiview_encoder import Encoder
 from gsim3d.nn.point_transformer import Attention
 from gsim3d.state import DYNAMIC, FROZEN, Particles
@@ -139,7 +140,7 @@ def test_rollout(import_model, file, case):
     )
     kept = mask[0, -1]
     with torch.no_grad():
-        steps = simulator.rollout(history, 3)
+        steps = simulator.rollout(history, 3, simulator.plan(EffectsSpec()))  # frozen particles stay
     for i, step in enumerate(steps):
         for ours, theirs in FIELDS.items():
             expected = c[f"out/{theirs}"][0, i][kept].squeeze(1)

@@ -40,7 +40,7 @@ def load(file, without=NOT_IN_GOLDEN):
     config = dataclasses.replace(dynamics_config(name), grid_size=float(g["grid_size"]))
     weights = renamed(g / "w")
     in_channels, out_channels = weights["stem.conv.weight"].shape[-1], weights["head.fc2.bias"].shape[0]
-    net = as_released(PointTransformer(in_channels, 0, out_channels, config), without).eval()
+    net = as_released(PointTransformer(in_channels, out_channels, config), without).eval()
     net.load_state_dict(weights)
     return g, net, config
 
@@ -149,8 +149,8 @@ def features_inside(net, config, case):
             note(f"enc{s}.block{i}/feat", block, output)
     for s, stage in enumerate(net.decoder):
         note(f"dec{s}.unmerger/feat", stage.unpool, lambda inputs, _out: inputs[0])
-        note(f"dec{s}.up/feat", stage.unpool, lambda _inputs, out: out[0])
-        note(f"dec{s}.up.proj_skip/feat", stage.unpool, lambda _inputs, out: out[1])
+        note(f"dec{s}.up/feat", stage.unpool, output)
+        note(f"dec{s}.up.proj_skip/feat", stage.unpool, lambda inputs, _out: inputs[1])
         first = stage.blocks[0].position.conv
         note(f"dec{s}.block0.cpe_conv/input_features", first, lambda inputs, _out: inputs[0])
         for i, block in enumerate(stage.blocks):
@@ -182,7 +182,8 @@ def test_geometry_inside(file):
     stages = pyramid_of(xyz, mask, config).stages
     assert_published_stage(stages[0], inter, "embedding/")
     positions = xyz.reshape(-1, 3)
-    depth = inter.get("embedding/serialized_depth", None)
+    key = "embedding/serialized_depth"
+    depth = inter[key] if key in inter else None  # noqa: SIM401
     for s in range(1, len(stages)):
         unmerged = (*config.merge_windows[: s - 1], *(1,) * (len(stages) - s))
         before = pyramid_of(xyz, mask, dataclasses.replace(config, merge_windows=unmerged)).stages[s]
