@@ -10,6 +10,7 @@ from gsim3d import presets
 from gsim3d.cameras import InputSpec
 from gsim3d.compat import load_released
 from gsim3d.compat.released_model import ReleasedModelConfig, ReleasedSimulator
+from gsim3d.data import Scene
 from gsim3d.effects.spec import DynamicsEffects, EffectsSpec
 from gsim3d.errors import InputError
 from gsim3d.io import checkpoint
@@ -20,6 +21,7 @@ from gsim3d.train.restore import restore
 from tests.asserts import assert_same_bits
 from tests.compat.release import small_config
 from tests.test_simulator import CONFIG, SIZE, make_frames, make_simulator, target_cameras
+from tests.tiny_scenes import write_scene
 
 INPUTS = InputSpec(history=2, context_views=2, image_size=(SIZE, SIZE), fps=30.0)
 
@@ -138,3 +140,17 @@ def test_shipped_simulators_load_by_name(name):
     simulator = Simulator.from_pretrained(name)
     assert simulator.inputs.history == 4 and simulator.inputs.image_size and simulator.inputs.fps
     assert simulator.config != presets.small()
+
+
+def test_scene_is_a_source_of_frames(tmp_path):
+    scene = Scene.open(write_scene(tmp_path / "scene", 4))
+    simulator = Simulator(presets.tiny()).eval()
+    simulator.inputs = InputSpec(history=2, context_views=2, image_size=(scene.width, scene.height))
+    frames = scene.input_frames(simulator.inputs)
+    assert frames.cloud_step.tolist() == [0, 1] and len(frames.cameras) == 4
+    prediction = simulator.predict(scene, 1, cameras=scene.cameras_at([2], [0]))
+    assert prediction.renderings[0].color.shape == (1, scene.height, scene.width, 3)
+    kept = dataclasses.replace(simulator.inputs, target_only_cameras=(2,))
+    assert torch.equal(scene.input_frames(kept).cameras.viewmats[:2], scene.cameras_at([0, 3], [0]).viewmats)
+    with pytest.raises(InputError, match="2 steps from step 3 on do not fit its 4 steps"):
+        scene.input_frames(simulator.inputs, start=3)
