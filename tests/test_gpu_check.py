@@ -119,7 +119,7 @@ def test_the_sanitizer_uses_all_gpus_alike(tree):
     assert set(used) == {"3", "5"} and abs(used.count("3") - used.count("5")) <= 1
 
 
-LAST = "racecheck_test_sentinel", "memcheck_test_sentinel"  # before what is added here
+LAST = "racecheck_test_validate_state", "memcheck_test_validate_state"  # before what is added here
 
 
 def test_a_check_that_is_stopped_goes_on_where_it_was(tree):

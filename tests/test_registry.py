@@ -10,7 +10,7 @@ OPS = sorted({name.split(".")[0] for name in torch._C._dispatch_get_all_op_names
 INTEGER_OPS = tuple(
     f"gsim3d::{name}"
     for name in (
-        "curve_ build_pyramid sparse_conv_plan watch_rows join_parts row_scenes find_cells overlapping_patches"
+        "curve_ build_pyramid sparse_conv_plan validate_state join_records row_scenes find_cells overlapping_patches"
     ).split()
 )
 

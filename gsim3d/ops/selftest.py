@@ -295,6 +295,6 @@ CHECKS: dict[str, Callable[[str], float]] = {
     "plane_sweep": _plane_sweep,
     "decode": _decode,
     "background": _background,
-    "sentinel": _validate_state,
+    "validate_state": _validate_state,
     "raster": _raster,
 }

@@ -120,7 +120,7 @@ def validate_state(
         check_real("validate_state", grid_size=grid_size, max_step=max_step)
     if neutral is not None:
         refuse("validate_state", {f"fields[{f}]": field for f, field in enumerate(fields)})
-    status, record, sanitized = torch.ops.gsim3d.watch_rows(
+    status, record, sanitized = torch.ops.gsim3d.validate_state(
         _detached(fields),
         [low for low, _ in bounds],
         [high for _, high in bounds],
@@ -147,7 +147,7 @@ def validate_state(
 def join_records(records: Sequence[PartialRecord]) -> Tensor:
     """float64 [M], the numbers of ``records`` one after another, in one launch."""
     parts, cu_rows, n_rows, *_ = zip(*records, strict=True)
-    return torch.ops.gsim3d.join_parts(list(parts), list(cu_rows), list(n_rows))
+    return torch.ops.gsim3d.join_records(list(parts), list(cu_rows), list(n_rows))
 
 
 def _detached(fields: Sequence[Tensor]) -> list[Tensor]:
@@ -182,7 +182,7 @@ def _check_arguments(
         check_real("validate_state", **{f"bounds[{f}][{end}]": value for end, value in enumerate(pair)})
 
 
-@fake("watch_rows")
+@fake("validate_state")
 def _(fields, low, high, cu_rows, cloud_scene, origin, activity, previous, grid_size, max_step, neutral, joined=True):
     columns = 2 * (len(fields) + 2) + len(SUMS)
     n_rows, n_records = fields[0].shape[0], cu_rows.shape[0] - 1
@@ -195,7 +195,7 @@ def _(fields, low, high, cu_rows, cloud_scene, origin, activity, previous, grid_
     )
 
 
-@fake("join_parts")
+@fake("join_records")
 def _(parts, cu_rows, n_rows):
     total = sum((offsets.shape[0] - 1) * own.shape[1] for own, offsets in zip(parts, cu_rows, strict=True))
     return parts[0].new_empty(total)

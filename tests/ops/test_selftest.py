@@ -59,7 +59,7 @@ def _off(value):
         ("background", "row_scenes"),
         ("background", "add_cells"),
         ("background", "overlapping_patches"),
-        ("sentinel", "validate_state"),
+        ("validate_state", "validate_state"),
         ("patch_attn", "joint_attention"),
         ("row_norm", "residual_norm"),
         ("row_norm", "norm_gelu"),

@@ -7,7 +7,7 @@ from gsim3d.errors import GradientError
 from gsim3d.ops import validate_state
 from gsim3d.ops.validate_state import FAST, OUTSIDE, SUMS, join_records
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, assert_same_bits_for_any_threads
-from tests.oracle import sentinel as oracle
+from tests.oracle import validate_state as oracle
 
 DTYPES = [torch.float32, torch.float64]
 BOUNDS = [(-3e38, 3e38), (0.0, 1.0), (-3.5, 3.5), (0.0, 1.0), (-4.0, 4.0)]
@@ -42,10 +42,10 @@ def state(clouds=CLOUDS, dtype=torch.float32, seed=0, device="cpu"):
 
 
 def look(arguments):
-    """(status, record, mended activity and fields)"""
+    """(status, record, sanitized activity and fields)"""
     fields, bounds, cu_rows, options = arguments
-    watched = validate_state(fields, bounds, cu_rows, neutral=NEUTRAL, **options)
-    return watched.status, watched.record, watched.activity, *watched.fields
+    found = validate_state(fields, bounds, cu_rows, neutral=NEUTRAL, **options)
+    return found.status, found.record, found.activity, *found.fields
 
 
 def assert_same_record(actual, expected, n_fields):
@@ -63,7 +63,7 @@ def assert_same_record(actual, expected, n_fields):
 @pytest.mark.parametrize("clouds", [CLOUDS, [0, 1], [0, 1024, 2048], [0, *range(1, 40), 1030, 1030, 2047, 4100]])
 def test_equals_the_oracle(clouds, dtype, device):
     fields, bounds, cu_rows, options = state(clouds, dtype)
-    expected_status, expected = oracle.watch_rows(fields, bounds, cu_rows, **options)
+    expected_status, expected = oracle.validate_state(fields, bounds, cu_rows, **options)
     status, record, *_ = look(state(clouds, dtype, device=device))
     assert_same_bits(status.cpu(), expected_status)
     assert_same_record(record, expected, len(fields))
@@ -76,23 +76,23 @@ def test_mends_as_the_oracle(clouds, dtype, knows_previous, device):
     fields, bounds, cu_rows, options = state(clouds, dtype)
     previous = options["previous"] if knows_previous else None
     options |= {"origin": torch.tensor([[0.1, -0.2, 0.3], [-0.05, 0.7, 0.0]], dtype=torch.float64)}
-    status, _ = oracle.watch_rows(fields, bounds, cu_rows, **options | {"previous": previous})
+    status, _ = oracle.validate_state(fields, bounds, cu_rows, **options | {"previous": previous})
     clouds = {name: options[name] for name in ("cloud_scene", "origin", "activity")}
-    expected = oracle.mended(fields, status, NEUTRAL, cu_rows, previous=previous, **clouds)
+    expected = oracle.sanitized(fields, status, NEUTRAL, cu_rows, previous=previous, **clouds)
     fields, bounds, cu_rows, moved = state(clouds=cu_rows.tolist(), dtype=dtype, device=device)
     moved |= {"origin": options["origin"].to(device), "previous": moved["previous"] if knows_previous else None}
-    _, _, *mended = look((fields, bounds, cu_rows, moved))
-    for actual, wanted, before in zip(mended, expected, (moved["activity"], *fields), strict=True):
+    _, _, *sanitized = look((fields, bounds, cu_rows, moved))
+    for actual, wanted, before in zip(sanitized, expected, (moved["activity"], *fields), strict=True):
         assert_same_bits(actual.cpu(), wanted)
         assert actual.data_ptr() != before.data_ptr() or not before.numel()
     assert bool((expected[0] != options["activity"]).any()) and bool((expected[1] != fields[0].cpu()).any())
 
 
-def test_rows_are_mended_only_if_asked():
+def test_rows_are_sanitized_only_if_asked():
     fields, bounds, cu_rows, options = state()
-    watched = validate_state(fields, bounds, cu_rows, **options)
-    assert watched.fields is None and watched.activity is None
-    assert_same_bits(watched.status, look(state())[0])
+    found = validate_state(fields, bounds, cu_rows, **options)
+    assert found.fields is None and found.activity is None
+    assert_same_bits(found.status, look(state())[0])
 
 
 def test_counts():
@@ -100,7 +100,7 @@ def test_counts():
         [[0.5, 0.5, 0.5], [0.5, float("nan"), 0.5], [-0.1, 0.5, 0.5], [0.9, 0.5, 0.5], [3.0, 0.5, 0.5]]
     )
     opacities = torch.tensor([0.25, 0.5, 0.5, 1.0, 2.0])
-    watched = validate_state(
+    found = validate_state(
         [means, opacities],
         [(-9.0, 9.0), (0.0, 1.0)],
         torch.tensor([0, 5]),
@@ -111,8 +111,8 @@ def test_counts():
         previous=[torch.tensor([[0.5, 0.5, 0.1]] + [[0.5, 0.5, 0.5]] * 4), opacities],
         max_step=0.7,
     )
-    assert watched.status.tolist() == [0, 1, OUTSIDE, 0, 0]
-    record = watched.record[0].tolist()
+    assert found.status.tolist() == [0, 1, OUTSIDE, 0, 0]
+    record = found.record[0].tolist()
     assert record[:8] == [1, 1, 0, -1, 1, 2, 0, -1]
     sums = dict(zip(SUMS, record[8:], strict=True))
     assert sums["awake"] == 2 and sums["opacity_mass"] == 2.25  # all but the row whose opacity is 2
@@ -199,10 +199,10 @@ def test_opcheck(device):
     names = ("cloud_scene", "origin", "activity", "previous", "grid_size", "max_step")
     arguments = (fields, low, high, cu_rows, *(options[name] for name in names))
     for neutral in ([], NEUTRAL):
-        torch.library.opcheck(torch.ops.gsim3d.watch_rows, (*arguments, neutral))
-    torch.library.opcheck(torch.ops.gsim3d.watch_rows, (*arguments, [], False))
-    parts = torch.ops.gsim3d.watch_rows(*arguments, [], False)[1]
-    torch.library.opcheck(torch.ops.gsim3d.join_parts, ([parts, parts], [cu_rows, cu_rows], [9, 9]))
+        torch.library.opcheck(torch.ops.gsim3d.validate_state, (*arguments, neutral))
+    torch.library.opcheck(torch.ops.gsim3d.validate_state, (*arguments, [], False))
+    parts = torch.ops.gsim3d.validate_state(*arguments, [], False)[1]
+    torch.library.opcheck(torch.ops.gsim3d.join_records, ([parts, parts], [cu_rows, cu_rows], [9, 9]))
 
 
 # 6 torch.compile
@@ -212,8 +212,8 @@ def test_compiles(device):
     fields, bounds, cu_rows, options = state([0, 3, 9], device=device)
 
     def f(means):
-        watched = validate_state([means, *fields[1:]], bounds, cu_rows, neutral=NEUTRAL, **options)
-        return watched.status + 0, watched.fields[2]
+        found = validate_state([means, *fields[1:]], bounds, cu_rows, neutral=NEUTRAL, **options)
+        return found.status + 0, found.fields[2]
 
     for a, b in zip(torch.compile(f, fullgraph=True)(fields[0]), f(fields[0]), strict=True):
         assert_same_bits(a, b)
@@ -283,7 +283,7 @@ def test_gradients_pass_by():
 def test_errors_name_what_is_wrong(change, message):
     fields, bounds, cu_rows, options = state()
     fields, options = change(fields, options)
-    with pytest.raises(ValueError, match="(validate_state|watch_rows): .*" + message):
+    with pytest.raises(ValueError, match="(validate_state|validate_state): .*" + message):
         options["previous"] = options["previous"] if len(fields) == 5 else None
         validate_state(fields, bounds[: len(fields)], cu_rows, **options)
 
@@ -292,20 +292,20 @@ def test_parts_that_do_not_fit():
     fields, bounds, cu_rows, options = state()
     record = validate_state(fields, bounds, cu_rows, join=False, **options).record
     for wrong, message in (
-        (record._replace(n_rows=9000), "parts must be as watch_rows left them, 13 of 9000 rows; got"),
-        (record._replace(parts=record.parts[:, 1:]), "parts must be as watch_rows left them"),
+        (record._replace(n_rows=9000), "parts must be as validate_state left them, 13 of 9000 rows; got"),
+        (record._replace(parts=record.parts[:, 1:]), "parts must be as validate_state left them"),
         (record._replace(parts=record.parts.float()), "parts must be float64; got float32"),
         (record._replace(cu_rows=cu_rows.int()), "cu_rows must be int64; got int32"),
         (record._replace(cu_rows=cu_rows.flip(0)), "cu_rows must run from 0 to N=5000; got 5000"),
     ):
-        with pytest.raises(ValueError, match="join_parts: " + message):
+        with pytest.raises(ValueError, match="join_records: " + message):
             join_records([record, wrong])
-    with pytest.raises(ValueError, match="join_parts: parts must be of one look at least"):
-        torch.ops.gsim3d.join_parts([record.parts], [], [5000])
+    with pytest.raises(ValueError, match="join_records: parts must be of one look at least"):
+        torch.ops.gsim3d.join_records([record.parts], [], [5000])
 
 
 def test_offsets_that_do_not_fit():
     fields, bounds, _, options = state()
     for offsets in ([0, 0, 7, 2500, 2500, 4999], [0, 9, 7, 2500, 2500, 5000]):
-        with pytest.raises(ValueError, match="watch_rows: cu_rows must"):
+        with pytest.raises(ValueError, match="validate_state: cu_rows must"):
             validate_state(fields, bounds, torch.tensor(offsets), **options)

@@ -77,7 +77,13 @@ CONSTANTS = (
         "csrc/gsim3d/curve/curve_math.h",
         "2^16 cells an axis: at 6 cm 4 km; cells outside are refused by the op",
     ),
-    Constant("kWatchedCells", "65536", "cells an axis", "csrc/gsim3d/sentinel/sentinel.h", "a particle outside sleeps"),
+    Constant(
+        "kWorkspaceCells",
+        "65536",
+        "cells an axis",
+        "csrc/gsim3d/validate_state/validate_state.h",
+        "a particle outside sleeps",
+    ),
     Constant(
         "kMinDepth",
         "T(1e-3)",

@@ -20,7 +20,7 @@
 #include "gsim3d/pool/pool.h"
 #include "gsim3d/raster/raster.h"
 #include "gsim3d/raster/raster_math.h"
-#include "gsim3d/sentinel/sentinel.h"
+#include "gsim3d/validate_state/validate_state.h"
 #include "gsim3d/sparse_conv/sparse_conv.h"
 
 namespace py = pybind11;
@@ -259,13 +259,13 @@ py::dict constants() {
                                       py::arg("smooth") = static_cast<int64_t>(RasterCutoff::kSmooth));
   values["raster_jacobians"] = py::dict(py::arg("exact") = static_cast<int64_t>(RasterJacobian::kExact),
                                         py::arg("clamped") = static_cast<int64_t>(RasterJacobian::kClamped));
-  values["validate_cells"] = static_cast<int64_t>(gsim3d::kWatchedCells);
+  values["validate_cells"] = static_cast<int64_t>(gsim3d::kWorkspaceCells);
   values["validate_outside"] = gsim3d::kOutside;
   values["validate_fast"] = gsim3d::kFast;
-  values["validate_max_fields"] = gsim3d::kMaxWatchedFields;
-  values["validate_sums"] = tuple_of(gsim3d::kWatchedSumNames, gsim3d::kWatchedSums);
-  values["validate_rows_a_part"] = py::dict(py::arg("cpu") = gsim3d::cpu::kWatchedPiece,
-                                            py::arg("cuda") = gsim3d::cuda::kWatchedPiece);
+  values["validate_max_fields"] = gsim3d::kMaxStateFields;
+  values["validate_sums"] = tuple_of(gsim3d::kStateSumNames, gsim3d::kStateSums);
+  values["validate_rows_a_part"] = py::dict(py::arg("cpu") = gsim3d::cpu::kStatePiece,
+                                            py::arg("cuda") = gsim3d::cuda::kStatePiece);
   return values;
 }
 

@@ -89,12 +89,12 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "decode_gaussians_backward(Tensor grad_quats, Tensor grad_scales, Tensor grad_sh, Tensor raw, Tensor readings, "
       "int degree, float scale_min, float scale_max) -> Tensor");
 
-  // sentinel: which rows cannot be used, what stands in for them, and sums over clouds.
+  // validate_state: invalid rows, their replacements, and sums over clouds.
   m.def(
-      "watch_rows(Tensor[] fields, float[] low, float[] high, Tensor cu_rows, Tensor cloud_scene, Tensor origin, "
+      "validate_state(Tensor[] fields, float[] low, float[] high, Tensor cu_rows, Tensor cloud_scene, Tensor origin, "
       "Tensor activity, Tensor[] previous, float grid_size, float max_step, float[] neutral, bool joined=True) -> "
-      "(Tensor status, Tensor record, Tensor[] mended)");
-  m.def("join_parts(Tensor[] parts, Tensor[] cu_rows, int[] n_rows) -> Tensor");
+      "(Tensor status, Tensor record, Tensor[] sanitized)");
+  m.def("join_records(Tensor[] parts, Tensor[] cu_rows, int[] n_rows) -> Tensor");
 
   // background: where rows meet one that was computed before. Lists have an entry a stage; tables a row a curve.
   m.def(

@@ -3,14 +3,14 @@
 #include <type_traits>
 
 #include "gsim3d/core/check.h"
-#include "gsim3d/sentinel/sentinel_math.h"
+#include "gsim3d/validate_state/validate_state_math.h"
 
 namespace gsim3d::cpu {
 namespace {
 
-using namespace sentinel;  // NOLINT: this file is its other half
+using namespace state_validation;  // NOLINT: this file is its other half
 
-constexpr int64_t kPiece = kWatchedPiece;
+constexpr int64_t kPiece = kStatePiece;
 
 void check_offsets(const char* op, const int64_t* cu_rows, int64_t n_clouds, int64_t n_rows) {
   check(cu_rows[0] == 0 && cu_rows[n_clouds] == n_rows, op, ": cu_rows must run from 0 to N=", n_rows, "; got ",
@@ -21,8 +21,8 @@ void check_offsets(const char* op, const int64_t* cu_rows, int64_t n_clouds, int
 }
 
 template <typename T>
-void check_rows(const WatchedRows<T>& r) {
-  constexpr const char* kOp = "watch_rows";
+void check_rows(const StateRows<T>& r) {
+  constexpr const char* kOp = "validate_state";
   check_offsets(kOp, r.cu_rows, r.n_clouds, r.n_rows);
   for (int64_t q = 0; q < r.n_clouds; ++q)
     check(r.cloud_scene[q] >= 0 && r.cloud_scene[q] < r.n_scenes, kOp, ": cloud_scene must be in [0, B) with B=",
@@ -31,7 +31,7 @@ void check_rows(const WatchedRows<T>& r) {
 
 // Whether every value of rows [begin, end) is in bounds; quick, as it nearly always is.
 template <typename T>
-bool all_in_bounds(const WatchedRows<T>& rows, int64_t begin, int64_t end) {
+bool all_in_bounds(const StateRows<T>& rows, int64_t begin, int64_t end) {
   using Mask = std::conditional_t<sizeof(T) == 4, int32_t, int64_t>;
   Mask out = 0;
   for (int f = 0; f < rows.n_fields; ++f) {
@@ -45,18 +45,18 @@ bool all_in_bounds(const WatchedRows<T>& rows, int64_t begin, int64_t end) {
 }
 
 template <typename T>
-void look_at_rows(const WatchedRows<T>& rows, const MendedRows<T>& mended, int64_t cloud, int64_t begin, int64_t end,
-                  int32_t* status, double* record) {
-  const int n_kinds = rows.n_fields + 2, columns = watched_columns(rows.n_fields);
+void look_at_rows(const StateRows<T>& rows, const SanitizedRows<T>& sanitized, int64_t cloud, int64_t begin,
+                  int64_t end, int32_t* status, double* record) {
+  const int n_kinds = rows.n_fields + 2, columns = record_columns(rows.n_fields);
   for (int c = 0; c < columns; ++c) record[c] = start_of(c, rows.n_fields, rows.n_rows);
   double* sums = record + 2 * n_kinds;
   const double* origin = rows.origin + 3 * rows.cloud_scene[cloud];
-  const bool clean = all_in_bounds(rows, begin, end), mends = mended.activity != nullptr;
-  if (mends) {
-    std::copy(rows.activity + begin, rows.activity + end, mended.activity + begin);
+  const bool clean = all_in_bounds(rows, begin, end), sanitizes = sanitized.activity != nullptr;
+  if (sanitizes) {
+    std::copy(rows.activity + begin, rows.activity + end, sanitized.activity + begin);
     for (int f = 0; f < rows.n_fields; ++f) {
       const int64_t first = begin * rows.width[f];
-      std::copy(rows.fields[f] + first, rows.fields[f] + end * rows.width[f], mended.fields[f] + first);
+      std::copy(rows.fields[f] + first, rows.fields[f] + end * rows.width[f], sanitized.fields[f] + first);
     }
   }
   for (int64_t row = begin; row < end; ++row) {
@@ -74,7 +74,7 @@ void look_at_rows(const WatchedRows<T>& rows, const MendedRows<T>& mended, int64
       }
       continue;
     }
-    if (mends) mend_row(rows, mended, state.status, origin, row);
+    if (sanitizes) sanitize_row(rows, sanitized, state.status, origin, row);
     for (int k = 0; k < n_kinds; ++k)
       if (state.status & bit_of(k, rows.n_fields)) {
         record[2 * k] += 1;
@@ -86,24 +86,24 @@ void look_at_rows(const WatchedRows<T>& rows, const MendedRows<T>& mended, int64
 }  // namespace
 
 template <typename T>
-void watch_rows(const WatchedRows<T>& rows, const MendedRows<T>& mended, int32_t* status, double* parts,
+void validate_state(const StateRows<T>& rows, const SanitizedRows<T>& sanitized, int32_t* status, double* parts,
                 const Parallel& parallel) {
   check_rows(rows);
-  const int columns = watched_columns(rows.n_fields);
+  const int columns = record_columns(rows.n_fields);
   const int64_t n_pieces = (rows.n_rows + kPiece - 1) / kPiece;
   parallel.chunks(n_pieces, [&](int64_t piece) {
     const int64_t begin = piece * kPiece, end = std::min(rows.n_rows, begin + kPiece);
     int64_t cloud = std::upper_bound(rows.cu_rows, rows.cu_rows + rows.n_clouds + 1, begin) - rows.cu_rows - 1;
     for (; cloud < rows.n_clouds && rows.cu_rows[cloud] < end; ++cloud) {
       const int64_t from = std::max(begin, rows.cu_rows[cloud]), to = std::min(end, rows.cu_rows[cloud + 1]);
-      if (from < to) look_at_rows(rows, mended, cloud, from, to, status, parts + (piece + cloud) * columns);
+      if (from < to) look_at_rows(rows, sanitized, cloud, from, to, status, parts + (piece + cloud) * columns);
     }
   });
 }
 
-void join_parts(const StatePartials& look) {
-  check_offsets("join_parts", look.cu_rows, look.n_clouds, look.n_rows);
-  const int columns = watched_columns(look.n_fields);
+void join_records(const StatePartials& look) {
+  check_offsets("join_records", look.cu_rows, look.n_clouds, look.n_rows);
+  const int columns = record_columns(look.n_fields);
   for (int64_t q = 0; q < look.n_clouds; ++q) {
     const int64_t begin = look.cu_rows[q], end = look.cu_rows[q + 1];
     for (int c = 0; c < columns; ++c) {
@@ -116,7 +116,7 @@ void join_parts(const StatePartials& look) {
 }
 
 #define GSIM3D_INSTANTIATE(T) \
-  template void watch_rows<T>(const WatchedRows<T>&, const MendedRows<T>&, int32_t*, double*, const Parallel&);
+  template void validate_state<T>(const StateRows<T>&, const SanitizedRows<T>&, int32_t*, double*, const Parallel&);
 GSIM3D_INSTANTIATE(float)
 GSIM3D_INSTANTIATE(double)
 #undef GSIM3D_INSTANTIATE

@@ -13,25 +13,25 @@
 
 namespace gsim3d {
 
-constexpr int kMaxWatchedFields = 9;
+constexpr int kMaxStateFields = 9;
 constexpr int32_t kOutside = 1 << 29, kFast = 1 << 30;
 constexpr uint8_t kAsleep = 2;         // Particles.activity of gsim3d/state.py
-constexpr double kWatchedCells = 65536;  // of a workspace along each axis: codes have 16 bits
+constexpr double kWorkspaceCells = 65536;  // of a workspace along each axis: codes have 16 bits
 // Columns of a record: count and first row (-1: none) of every field, of kOutside and of kFast; then how many rows are
 // usable and awake, half their squared displacements, the opacities of all rows that have one in bounds, and the lowest
 // and highest positions of the awake.
-constexpr int kWatchedSums = 9;
-constexpr const char* kWatchedSumNames[kWatchedSums] = {"awake", "kinetic_energy", "opacity_mass", "low_x", "low_y",
+constexpr int kStateSums = 9;
+constexpr const char* kStateSumNames[kStateSums] = {"awake", "kinetic_energy", "opacity_mass", "low_x", "low_y",
                                                         "low_z", "high_x", "high_y", "high_z"};
-constexpr int watched_columns(int n_fields) { return 2 * (n_fields + 2) + kWatchedSums; }
+constexpr int record_columns(int n_fields) { return 2 * (n_fields + 2) + kStateSums; }
 
 template <typename T>
-struct WatchedRows {
-  const T* fields[kMaxWatchedFields];  // [n_rows, width[f]]
-  int64_t width[kMaxWatchedFields];    // 3, 1, ...
-  T low[kMaxWatchedFields], high[kMaxWatchedFields];
-  int n_fields;                          // 2 to kMaxWatchedFields
-  const T* previous[kMaxWatchedFields];  // [n_rows, width[f]] one step before, or all null
+struct StateRows {
+  const T* fields[kMaxStateFields];  // [n_rows, width[f]]
+  int64_t width[kMaxStateFields];    // 3, 1, ...
+  T low[kMaxStateFields], high[kMaxStateFields];
+  int n_fields;                          // 2 to kMaxStateFields
+  const T* previous[kMaxStateFields];  // [n_rows, width[f]] one step before, or all null
   const uint8_t* activity;    // [n_rows]
   const int64_t* cu_rows;     // [n_clouds + 1]
   const int64_t* cloud_scene;  // [n_clouds] in [0, n_scenes)
@@ -45,40 +45,40 @@ struct WatchedRows {
 // step before; where there was none the corner of its workspace, and `neutral` followed by zeros. Opacity is 0 after a
 // fault.
 template <typename T>
-struct MendedRows {
-  T* fields[kMaxWatchedFields];  // [n_rows, width[f]]
-  uint8_t* activity;             // [n_rows]; null: nothing is mended
-  T neutral[kMaxWatchedFields];
+struct SanitizedRows {
+  T* fields[kMaxStateFields];  // [n_rows, width[f]]
+  uint8_t* activity;             // [n_rows]; null: nothing is sanitized
+  T neutral[kMaxStateFields];
 };
 
 // What looks leave of their sums: a partial record of every piece of rows, and of every cloud in it. A piece and a
 // cloud that share rows ascend in one and never descend in the other, so that their sum names the pair.
-constexpr int64_t watched_parts(int64_t n_rows, int64_t n_clouds, int64_t piece) {
+constexpr int64_t record_parts(int64_t n_rows, int64_t n_clouds, int64_t piece) {
   const int64_t most = (n_rows + piece - 1) / piece + n_clouds - 1;
   return most > 0 ? most : 0;
 }
 
 // The parts of one look, and where its record goes.
 struct StatePartials {
-  const double* parts;     // [watched_parts(n_rows, n_clouds, kWatchedPiece), watched_columns(n_fields)]
+  const double* parts;     // [record_parts(n_rows, n_clouds, kStatePiece), record_columns(n_fields)]
   const int64_t* cu_rows;  // [n_clouds + 1]
-  double* record;          // [n_clouds, watched_columns(n_fields)]
+  double* record;          // [n_clouds, record_columns(n_fields)]
   int64_t n_rows, n_clouds;
   int n_fields;
 };
 
 namespace cpu {
 
-constexpr int64_t kWatchedPiece = 1024;  // rows
+constexpr int64_t kStatePiece = 1024;  // rows
 
 template <typename T>
-void watch_rows(const WatchedRows<T>& rows, const MendedRows<T>& mended,
+void validate_state(const StateRows<T>& rows, const SanitizedRows<T>& sanitized,
                 int32_t* status,  // [n_rows]
                 double* parts,    // as in StatePartials
                 const Parallel& parallel);
 
 // Throws ArgumentError unless offsets ascend from 0 to n_rows.
-void join_parts(const StatePartials& look);
+void join_records(const StatePartials& look);
 
 }  // namespace cpu
 
@@ -86,13 +86,13 @@ void join_parts(const StatePartials& look);
 // offsets descend a record counts nothing.
 namespace cuda {
 
-constexpr int64_t kWatchedPiece = 128;  // few rows, so that small states too fill a GPU
+constexpr int64_t kStatePiece = 128;  // few rows, so that small states too fill a GPU
 
 template <typename T>
-void watch_rows(const WatchedRows<T>& rows, const MendedRows<T>& mended, int32_t* status, double* parts,
+void validate_state(const StateRows<T>& rows, const SanitizedRows<T>& sanitized, int32_t* status, double* parts,
                 Stream stream);
 
-void join_parts(const StatePartials* looks, int64_t n_looks, Stream stream);
+void join_records(const StatePartials* looks, int64_t n_looks, Stream stream);
 
 }  // namespace cuda
 }  // namespace gsim3d

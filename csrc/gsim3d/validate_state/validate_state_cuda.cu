@@ -1,22 +1,22 @@
-// A block looks at a piece of rows, copies them, mends its copy and leaves a partial record of each cloud in the piece;
-// a second kernel joins the partial records of a cloud in order, of many looks at once.
+// A block looks at a piece of rows, copies them, sanitizes its copy and leaves a partial record of each cloud in the
+// piece; a second kernel joins the partial records of a cloud in order, of many looks at once.
 #include <algorithm>
 
 #include "gsim3d/core/cuda_utils.cuh"
 #include "gsim3d/core/pack.cuh"
-#include "gsim3d/sentinel/sentinel_math.h"
+#include "gsim3d/validate_state/validate_state_math.h"
 
 namespace gsim3d::cuda {
 namespace {
 
-using namespace sentinel;  // NOLINT: this file is its other half
+using namespace state_validation;  // NOLINT: this file is its other half
 
-constexpr const char* kWatch = "watch_rows";
-constexpr int kPiece = kWatchedPiece;  // rows of a block, one a thread
+constexpr const char* kValidate = "validate_state";
+constexpr int kPiece = kStatePiece;  // rows of a block, one a thread
 constexpr int kWarps = kPiece / kWarp;
 constexpr int kBatch = 4;             // packs that a thread reads before it looks at the first
 constexpr int kTeams = 1024 / kWarp;  // that share the partial records of a cloud
-static_assert(watched_columns(kMaxWatchedFields) <= kWarp);
+static_assert(record_columns(kMaxStateFields) <= kWarp);
 
 // One field of a piece as a run of numbers, 16 bytes a read where its addresses allow it: copies it and says whether a
 // number that this thread read is out of bounds.
@@ -83,27 +83,27 @@ struct Sums {
 
 template <typename T>
 __global__ void __launch_bounds__(kPiece)
-    look_kernel(const __grid_constant__ WatchedRows<T> rows, const __grid_constant__ MendedRows<T> mended,
+    look_kernel(const __grid_constant__ StateRows<T> rows, const __grid_constant__ SanitizedRows<T> sanitized,
                 int32_t* status, double* parts) {
-  constexpr int kKinds = kMaxWatchedFields + 2;
+  constexpr int kKinds = kMaxStateFields + 2;
   __shared__ int32_t counts[kKinds], firsts[kKinds];
-  __shared__ double of_warp[kWarps][kWatchedSums];
-  const int n_fields = rows.n_fields, n_kinds = n_fields + 2, columns = watched_columns(n_fields);
+  __shared__ double of_warp[kWarps][kStateSums];
+  const int n_fields = rows.n_fields, n_kinds = n_fields + 2, columns = record_columns(n_fields);
   const int64_t begin = static_cast<int64_t>(blockIdx.x) * kPiece, end = min(rows.n_rows, begin + kPiece);
   const int64_t row = begin + threadIdx.x;
-  const bool mends = mended.activity != nullptr;
+  const bool sanitizes = sanitized.activity != nullptr;
   bool bad = false;
   for (int f = 0; f < n_fields; ++f) {
     const int64_t width = rows.width[f], first = begin * width;
-    bad |= look_at_field(rows.fields[f] + first, mends ? mended.fields[f] + first : nullptr, (end - begin) * width,
-                         rows.low[f], rows.high[f]);
+    bad |= look_at_field(rows.fields[f] + first, sanitizes ? sanitized.fields[f] + first : nullptr,
+                         (end - begin) * width, rows.low[f], rows.high[f]);
   }
-  const bool any_bad = __syncthreads_or(bad);  // also: what is mended is copied already
+  const bool any_bad = __syncthreads_or(bad);  // also: what is sanitized is copied already
   const int32_t faults = any_bad && row < end ? faults_of_fields(rows, row) : 0;
   const uint8_t activity = row < end ? rows.activity[row] : kAsleep;
   if (row < end) {  // offsets that do not fit leave rows without a cloud
     status[row] = 0;
-    if (mends) mended.activity[row] = activity;
+    if (sanitizes) sanitized.activity[row] = activity;
   }
   int64_t low = 0, high = rows.n_clouds;  // the last cloud that begins at or before the piece
   while (high - low > 1) {
@@ -128,7 +128,7 @@ __global__ void __launch_bounds__(kPiece)
         for (int i = 0; i < 3; ++i) sums.low[i] = sums.high[i] = rows.fields[0][row * 3 + i];
       } else if (activity != kAsleep) {
         status[row] = state.status;
-        if (mends) mend_row(rows, mended, state.status, origin, row);
+        if (sanitizes) sanitize_row(rows, sanitized, state.status, origin, row);
         for (int k = 0; k < n_kinds; ++k) {
           if (!(state.status & bit_of(k, n_fields))) continue;
           atomicAdd(&counts[k], 1), atomicMin(&firsts[k], static_cast<int>(threadIdx.x));
@@ -162,7 +162,7 @@ struct Looks {
 __global__ void __launch_bounds__(kTeams* kWarp) join_kernel(const __grid_constant__ Looks looks) {
   __shared__ double of_team[kTeams][kWarp];
   const StatePartials& look = looks.of[blockIdx.y];
-  const int columns = watched_columns(look.n_fields), column = threadIdx.x % kWarp, team = threadIdx.x / kWarp;
+  const int columns = record_columns(look.n_fields), column = threadIdx.x % kWarp, team = threadIdx.x / kWarp;
   bool ascends = true;  // else some pairs of a piece and a cloud have no partial record
   for (int64_t q = threadIdx.x; q < look.n_clouds; q += kTeams * kWarp)
     ascends &= look.cu_rows[q] <= look.cu_rows[q + 1];
@@ -193,25 +193,25 @@ __global__ void __launch_bounds__(kTeams* kWarp) join_kernel(const __grid_consta
 }  // namespace
 
 template <typename T>
-void watch_rows(const WatchedRows<T>& rows, const MendedRows<T>& mended, int32_t* status, double* parts,
+void validate_state(const StateRows<T>& rows, const SanitizedRows<T>& sanitized, int32_t* status, double* parts,
                 Stream stream) {
-  launch(kWatch, look_kernel<T>, blocks_for(kWatch, rows.n_rows, kPiece), kPiece, 0, stream, rows, mended, status,
-         parts);
+  launch(kValidate, look_kernel<T>, blocks_for(kValidate, rows.n_rows, kPiece), kPiece, 0, stream, rows, sanitized,
+         status, parts);
 }
 
-void join_parts(const StatePartials* all, int64_t n_looks, Stream stream) {
+void join_records(const StatePartials* all, int64_t n_looks, Stream stream) {
   for (int64_t first = 0; first < n_looks; first += kLooks) {
     Looks looks{};
     const int64_t n = std::min<int64_t>(n_looks - first, kLooks);
     int64_t most = 0;
     for (int64_t i = 0; i < n; ++i) looks.of[i] = all[first + i], most = std::max(most, all[first + i].n_clouds);
     const dim3 blocks(static_cast<unsigned>(std::min<int64_t>(most, 1 << 16)), static_cast<unsigned>(n));
-    launch("join_parts", join_kernel, blocks, kTeams * kWarp, 0, stream, looks);
+    launch("join_records", join_kernel, blocks, kTeams * kWarp, 0, stream, looks);
   }
 }
 
 #define GSIM3D_INSTANTIATE(T) \
-  template void watch_rows<T>(const WatchedRows<T>&, const MendedRows<T>&, int32_t*, double*, Stream);
+  template void validate_state<T>(const StateRows<T>&, const SanitizedRows<T>&, int32_t*, double*, Stream);
 GSIM3D_INSTANTIATE(float)
 GSIM3D_INSTANTIATE(double)
 #undef GSIM3D_INSTANTIATE

@@ -4,9 +4,9 @@
 #include <cmath>
 
 #include "gsim3d/core/platform.h"
-#include "gsim3d/sentinel/sentinel.h"
+#include "gsim3d/validate_state/validate_state.h"
 
-namespace gsim3d::sentinel {
+namespace gsim3d::state_validation {
 
 constexpr double kLargest = 3.4028234663852886e38;  // of float32
 
@@ -17,7 +17,7 @@ struct RowState {
 
 // Bits of the fields that are out of bounds.
 template <typename T>
-GSIM3D_HD int32_t faults_of_fields(const WatchedRows<T>& rows, int64_t row) {
+GSIM3D_HD int32_t faults_of_fields(const StateRows<T>& rows, int64_t row) {
   int32_t faults = 0;
   for (int f = 0; f < rows.n_fields; ++f) {
     const int64_t width = rows.width[f];
@@ -31,7 +31,7 @@ GSIM3D_HD int32_t faults_of_fields(const WatchedRows<T>& rows, int64_t row) {
 
 // `faults`: those of its fields. `origin`: of the row's scene; null: there is none, and no workspace.
 template <typename T>
-GSIM3D_HD RowState look_at_row(const WatchedRows<T>& rows, int64_t row, int32_t faults, const double* origin) {
+GSIM3D_HD RowState look_at_row(const StateRows<T>& rows, int64_t row, int32_t faults, const double* origin) {
   RowState state{faults, 0};
   if (faults & 1) return state;
   const T* position = rows.fields[0] + row * 3;
@@ -39,7 +39,7 @@ GSIM3D_HD RowState look_at_row(const WatchedRows<T>& rows, int64_t row, int32_t 
     bool within = true;
     for (int i = 0; i < 3; ++i) {
       const double cell = (static_cast<double>(position[i]) - origin[i]) / rows.grid_size;
-      within &= cell >= 0 && cell < kWatchedCells;
+      within &= cell >= 0 && cell < kWorkspaceCells;
     }
     state.status |= within ? 0 : kOutside;
   }
@@ -60,22 +60,22 @@ GSIM3D_HD bool keeps_numbers(int32_t status) { return (status & ((kOutside - 1) 
 
 // Number i of field f in place of a row's own.
 template <typename T>
-GSIM3D_HD T stand_in(const WatchedRows<T>& rows, const MendedRows<T>& mended, int32_t status, const double* origin,
+GSIM3D_HD T stand_in(const StateRows<T>& rows, const SanitizedRows<T>& sanitized, int32_t status, const double* origin,
                      int f, int64_t row, int64_t i) {
   if (f == 1 && (status & (kOutside - 1))) return 0;
   if (rows.previous[f] != nullptr) return rows.previous[f][row * rows.width[f] + i];
   if (f == 0) return origin == nullptr ? T{0} : static_cast<T>(origin[i]);
-  return i == 0 ? mended.neutral[f] : T{0};
+  return i == 0 ? sanitized.neutral[f] : T{0};
 }
 
 template <typename T>
-GSIM3D_HD void mend_row(const WatchedRows<T>& rows, const MendedRows<T>& mended, int32_t status, const double* origin,
-                        int64_t row) {
-  if (status != 0) mended.activity[row] = kAsleep;
+GSIM3D_HD void sanitize_row(const StateRows<T>& rows, const SanitizedRows<T>& sanitized, int32_t status,
+                            const double* origin, int64_t row) {
+  if (status != 0) sanitized.activity[row] = kAsleep;
   if (keeps_numbers(status)) return;
   for (int f = 0; f < rows.n_fields; ++f)
     for (int64_t i = 0; i < rows.width[f]; ++i)
-      mended.fields[f][row * rows.width[f] + i] = stand_in(rows, mended, status, origin, f, row, i);
+      sanitized.fields[f][row * rows.width[f] + i] = stand_in(rows, sanitized, status, origin, f, row, i);
 }
 
 // The bit of kind k: the fields, kOutside, kFast.
@@ -108,4 +108,4 @@ GSIM3D_HD double finished(int column, int n_fields, int64_t n_rows, double value
   return is_first && value >= static_cast<double>(n_rows) ? -1 : value;
 }
 
-}  // namespace gsim3d::sentinel
+}  // namespace gsim3d::state_validation

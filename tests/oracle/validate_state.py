@@ -6,8 +6,10 @@ LARGEST = torch.finfo(torch.float32).max
 CELLS, OUTSIDE, FAST, ASLEEP = 2**16, 1 << 29, 1 << 30, 2
 
 
-def watch_rows(fields, bounds, cu_rows, cloud_scene, origin, activity, grid_size=0.0, previous=None, max_step=LARGEST):
-    """(status, record) of gsim3d.ops.watch_rows."""
+def validate_state(
+    fields, bounds, cu_rows, cloud_scene, origin, activity, grid_size=0.0, previous=None, max_step=LARGEST
+):
+    """(status, record) of gsim3d.ops.validate_state."""
     is_asleep = activity == ASLEEP
     with torch.no_grad():
         means, opacities = fields[0], fields[1]
@@ -50,7 +52,7 @@ def watch_rows(fields, bounds, cu_rows, cloud_scene, origin, activity, grid_size
         return status, record
 
 
-def mended(fields, status, neutral, cu_rows, cloud_scene, origin, activity, previous=None):
+def sanitized(fields, status, neutral, cu_rows, cloud_scene, origin, activity, previous=None):
     """(activity, *fields) of rows of which those with a status sleep."""
     faulty, goes_back = status & (OUTSIDE - 1) != 0, status & (OUTSIDE - 1 | FAST) != 0
     rows = [torch.where(status != 0, ASLEEP, activity)]

@@ -1,4 +1,4 @@
-#include "gsim3d/sentinel/sentinel.h"
+#include "gsim3d/validate_state/validate_state.h"
 
 #include <algorithm>
 #include <string>
@@ -9,11 +9,11 @@
 namespace gsim3d::binding {
 namespace {
 
-constexpr int64_t watched_piece(bool is_cuda) { return is_cuda ? cuda::kWatchedPiece : cpu::kWatchedPiece; }
+constexpr int64_t state_piece(bool is_cuda) { return is_cuda ? cuda::kStatePiece : cpu::kStatePiece; }
 
 // Records of looks, one after another.
-Tensor join_parts(std::vector<Tensor> parts, std::vector<Tensor> cu_rows, std::vector<int64_t> n_rows) {
-  const char* op = "join_parts";
+Tensor join_records(std::vector<Tensor> parts, std::vector<Tensor> cu_rows, std::vector<int64_t> n_rows) {
+  const char* op = "join_records";
   check(!parts.empty() && parts.size() == cu_rows.size() && parts.size() == n_rows.size(), op,
         ": parts must be of one look at least, cu_rows and n_rows of as many; got ", parts.size(), ", ",
         cu_rows.size(), " and ", n_rows.size());
@@ -29,12 +29,12 @@ Tensor join_parts(std::vector<Tensor> parts, std::vector<Tensor> cu_rows, std::v
           shape_of(cu_rows[i]));
     check(n_rows[i] >= 0, op, ": n_rows must not be negative; got ", n_rows[i]);
     const int64_t n_clouds = cu_rows[i].size(0) - 1;
-    const int64_t n_parts = watched_parts(n_rows[i], n_clouds, watched_piece(parts[0].is_cuda()));
+    const int64_t n_parts = record_parts(n_rows[i], n_clouds, state_piece(parts[0].is_cuda()));
     const int64_t columns = parts[i].dim() == 2 ? parts[i].size(1) : 0;
-    const int64_t n_fields = (columns - kWatchedSums) / 2 - 2;
-    check(n_fields >= 2 && n_fields <= kMaxWatchedFields && columns == watched_columns(static_cast<int>(n_fields)) &&
+    const int64_t n_fields = (columns - kStateSums) / 2 - 2;
+    check(n_fields >= 2 && n_fields <= kMaxStateFields && columns == record_columns(static_cast<int>(n_fields)) &&
               parts[i].size(0) == n_parts,
-          op, ": parts must be as watch_rows left them, ", n_parts, " of ", n_rows[i], " rows; got ",
+          op, ": parts must be as validate_state left them, ", n_parts, " of ", n_rows[i], " rows; got ",
           shape_of(parts[i]));
     looks.push_back({data<double>(parts[i]), data<int64_t>(cu_rows[i]), nullptr, n_rows[i], n_clouds,
                      static_cast<int>(n_fields)});
@@ -44,25 +44,25 @@ Tensor join_parts(std::vector<Tensor> parts, std::vector<Tensor> cu_rows, std::v
   double* record = mutable_data<double>(records);
   for (StatePartials& look : looks) {
     look.record = record;
-    record += look.n_clouds * watched_columns(look.n_fields);
+    record += look.n_clouds * record_columns(look.n_fields);
   }
   if constexpr (kWithCuda)
     if (parts[0].is_cuda()) {
-      cuda::join_parts(looks.data(), static_cast<int64_t>(looks.size()), current_stream(parts[0]));
+      cuda::join_records(looks.data(), static_cast<int64_t>(looks.size()), current_stream(parts[0]));
       return records;
     }
-  for (const StatePartials& look : looks) cpu::join_parts(look);
+  for (const StatePartials& look : looks) cpu::join_records(look);
   return records;
 }
 
-// The mended activity and fields, or nothing where `neutral` holds no numbers.
-std::tuple<Tensor, Tensor, std::vector<Tensor>> watch_rows(
+// The sanitized activity and fields, or nothing where `neutral` holds no numbers.
+std::tuple<Tensor, Tensor, std::vector<Tensor>> validate_state(
     std::vector<Tensor> fields, std::vector<double> low, std::vector<double> high, const Tensor& cu_rows_,
     const Tensor& cloud_scene_, const Tensor& origin_, const Tensor& activity_, std::vector<Tensor> previous,
     double grid_size, double max_step, std::vector<double> neutral, bool joined) {
-  const char* op = "watch_rows";
+  const char* op = "validate_state";
   const auto n_fields = static_cast<int64_t>(fields.size());
-  check(n_fields >= 2 && n_fields <= kMaxWatchedFields, op, ": fields must be 2 to ", kMaxWatchedFields,
+  check(n_fields >= 2 && n_fields <= kMaxStateFields, op, ": fields must be 2 to ", kMaxStateFields,
         " tensors, positions and opacities first; got ", n_fields);
   check(low.size() == fields.size() && high.size() == fields.size(), op, ": low and high must have one bound a field");
   check(previous.empty() || previous.size() == fields.size(), op, ": previous must have one tensor a field; got ",
@@ -101,8 +101,8 @@ std::tuple<Tensor, Tensor, std::vector<Tensor>> watch_rows(
     previous[f] = rows_of(previous[f]);
   }
   Tensor status = empty(fields[0], {n}, ScalarType::Int);
-  const int64_t columns = watched_columns(static_cast<int>(n_fields));
-  const int64_t n_parts = watched_parts(n, n_clouds, watched_piece(fields[0].is_cuda()));
+  const int64_t columns = record_columns(static_cast<int>(n_fields));
+  const int64_t n_parts = record_parts(n, n_clouds, state_piece(fields[0].is_cuda()));
   Tensor parts = empty(fields[0], {n_parts, columns}, ScalarType::Double);
   std::vector<Tensor> made;
   if (!neutral.empty()) {
@@ -110,8 +110,8 @@ std::tuple<Tensor, Tensor, std::vector<Tensor>> watch_rows(
     for (const Tensor& field : fields) made.push_back(torch::stable::new_empty(field, field.sizes()));
   }
   dispatch_float(op, "fields", fields[0], [&]<typename T>() {
-    WatchedRows<T> rows{};
-    MendedRows<T> mended{};
+    StateRows<T> rows{};
+    SanitizedRows<T> sanitized{};
     for (int64_t f = 0; f < n_fields; ++f) {
       rows.fields[f] = data<T>(fields[f]);
       rows.width[f] = 1;
@@ -119,10 +119,10 @@ std::tuple<Tensor, Tensor, std::vector<Tensor>> watch_rows(
       rows.low[f] = static_cast<T>(low[f]), rows.high[f] = static_cast<T>(high[f]);
       rows.previous[f] = previous.empty() ? nullptr : data<T>(previous[f]);
       if (made.empty()) continue;
-      mended.fields[f] = mutable_data<T>(made[f + 1]);
-      mended.neutral[f] = static_cast<T>(neutral[f]);
+      sanitized.fields[f] = mutable_data<T>(made[f + 1]);
+      sanitized.neutral[f] = static_cast<T>(neutral[f]);
     }
-    mended.activity = made.empty() ? nullptr : mutable_data<uint8_t>(made[0]);
+    sanitized.activity = made.empty() ? nullptr : mutable_data<uint8_t>(made[0]);
     rows.n_fields = static_cast<int>(n_fields);
     rows.activity = data<uint8_t>(activity);
     rows.cu_rows = data<int64_t>(cu_rows), rows.cloud_scene = data<int64_t>(cloud_scene);
@@ -132,8 +132,8 @@ std::tuple<Tensor, Tensor, std::vector<Tensor>> watch_rows(
     auto* seen = mutable_data<int32_t>(status);
     auto* sums = mutable_data<double>(parts);
     if constexpr (kWithCuda)
-      if (fields[0].is_cuda()) return cuda::watch_rows<T>(rows, mended, seen, sums, current_stream(fields[0]));
-    cpu::watch_rows<T>(rows, mended, seen, sums, torch_parallel());
+      if (fields[0].is_cuda()) return cuda::validate_state<T>(rows, sanitized, seen, sums, current_stream(fields[0]));
+    cpu::validate_state<T>(rows, sanitized, seen, sums, torch_parallel());
   });
   if (!joined) return {status, parts, made};
   Tensor record = empty(fields[0], {n_clouds, columns}, ScalarType::Double);
@@ -141,16 +141,16 @@ std::tuple<Tensor, Tensor, std::vector<Tensor>> watch_rows(
                            static_cast<int>(n_fields)};
   if constexpr (kWithCuda)
     if (record.is_cuda()) {
-      cuda::join_parts(&look, 1, current_stream(record));
+      cuda::join_records(&look, 1, current_stream(record));
       return {status, record, made};
     }
-  cpu::join_parts(look);
+  cpu::join_records(look);
   return {status, record, made};
 }
 
 void kernels(auto& m) {
-  m.impl("watch_rows", TORCH_BOX(&watch_rows));
-  m.impl("join_parts", TORCH_BOX(&join_parts));
+  m.impl("validate_state", TORCH_BOX(&validate_state));
+  m.impl("join_records", TORCH_BOX(&join_records));
 }
 
 }  // namespace
