@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from gsim3d.errors import InputError, did_you_mean
+from gsim3d.pretrained import KEEP
 
 
 class Parser(argparse.ArgumentParser):
@@ -33,6 +34,22 @@ class Parser(argparse.ArgumentParser):
             known = [str(choice) for choice in action.choices]
             hint = did_you_mean(str(value), known)
             raise argparse.ArgumentError(action, f"invalid choice: {value!r} (choose from {', '.join(known)}){hint}")
+
+
+def add_fitting(parser: argparse.ArgumentParser) -> None:
+    """Adds the options of commands that open scenes for a model."""
+    parser.add_argument(
+        "--keep",
+        nargs="+",
+        choices=KEEP,
+        default=(),
+        help="what of the scene is not fitted to the model: image: scaled, not cropped; depth: near and far",
+    )
+    parser.add_argument(
+        "--resample",
+        action="store_true",
+        help="of a scene with k times the frame rate that the model was trained at, take every k-th frame",
+    )
 
 
 def whole(least: int, most: float = math.inf) -> Callable[[str], int]:

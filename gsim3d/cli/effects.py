@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from functools import partial
 
-from gsim3d.cli.arguments import decibels
+from gsim3d.cli.arguments import add_fitting, decibels
 from gsim3d.io.terminal import progress
-from gsim3d.pretrained import CHECKPOINT_HELP, add_fitting
+from gsim3d.pretrained import CHECKPOINT_HELP
 
 EPILOG = """\
 Each effect that the checkpoint's spec has on is switched off alone, or lowered, and predictions of four steps at the

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from gsim3d.cli.arguments import whole
-from gsim3d.pretrained import CHECKPOINT_HELP, add_fitting
+from gsim3d.cli.arguments import add_fitting, whole
+from gsim3d.pretrained import CHECKPOINT_HELP
 
 EPILOG = """\
 Every scene's first steps are given, all others predicted and compared with the video, seen from cameras that were no

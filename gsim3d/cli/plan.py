@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from gsim3d.pretrained import CHECKPOINT_HELP, add_fitting, located
+from gsim3d.cli.arguments import add_fitting
+from gsim3d.pretrained import CHECKPOINT_HELP, located
 
 EPILOG = """\
 Without --effects the spec is effects.yaml of the scene or of the data set around it, else that of the checkpoint,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 
-from gsim3d.cli.arguments import whole
+from gsim3d.cli.arguments import add_fitting, whole
 from gsim3d.io.terminal import progress
-from gsim3d.pretrained import CHECKPOINT_HELP, add_fitting
+from gsim3d.pretrained import CHECKPOINT_HELP
 
 EPILOG = """\
 The scene's first steps are the input; the following ones are predicted, also beyond the end of the video. Written to

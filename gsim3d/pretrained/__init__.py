@@ -7,7 +7,6 @@ the model breaks laws of docs/results/stability.md: the worst number of each, as
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 
@@ -17,22 +16,6 @@ FOLDER = Path(__file__).parent
 WEIGHTS, CONFIG, LAWS = "model.safetensors", "config.yaml", "laws.json"
 CHECKPOINT_HELP = "run folder, checkpoint folder, .safetensors file, or name of a simulator that comes with gsim3d"
 KEEP = ("image", "depth")  # parts of a scene that need not be fitted to a model
-
-
-def add_fitting(parser: argparse.ArgumentParser) -> None:
-    """Adds the options of commands that open scenes for a model."""
-    parser.add_argument(
-        "--keep",
-        nargs="+",
-        choices=KEEP,
-        default=(),
-        help="what of the scene is not fitted to the model: image: scaled, not cropped; depth: near and far",
-    )
-    parser.add_argument(
-        "--resample",
-        action="store_true",
-        help="of a scene with k times the frame rate that the model was trained at, take every k-th frame",
-    )
 
 
 def known_failures(checkpoint: str | Path) -> dict[str, dict]:
