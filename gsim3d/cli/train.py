@@ -51,12 +51,12 @@ def run(args: argparse.Namespace) -> int:
 
     from gsim3d.data import find_scenes, split_scenes
     from gsim3d.errors import InputError
-    from gsim3d.io.files import output_path
-    from gsim3d.io.settings import from_dict, load_yaml, to_dict
+    from gsim3d.io.files import output_path, read_yaml
+    from gsim3d.io.settings import from_dict, to_dict
     from gsim3d.synth.held_out import refuse_held_out
     from gsim3d.train.config import TrainConfig
 
-    config = from_dict(TrainConfig, load_yaml(args.config)) if args.config else TrainConfig()
+    config = from_dict(TrainConfig, read_yaml(args.config)) if args.config else TrainConfig()
     if args.print_config:
         print(yaml.safe_dump(to_dict(config), sort_keys=False), end="")
         return 0

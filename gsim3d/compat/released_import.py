@@ -15,8 +15,8 @@ from gsim3d.compat.released_file import ReleasedFile, state_dict
 from gsim3d.compat.released_model import ReleasedSimulator
 from gsim3d.errors import InputError
 from gsim3d.io import checkpoint
-from gsim3d.io.files import new_output_path, with_parents
-from gsim3d.io.settings import load_yaml, to_dict
+from gsim3d.io.files import new_output_path, read_yaml, with_parents
+from gsim3d.io.settings import to_dict
 from gsim3d.presets import ModelConfig
 
 MAX_NAMED = 8  # tensors that a message lists
@@ -155,7 +155,7 @@ def write_imported(source: str | Path, settings_file: str | Path, out: str | Pat
     Raises:
         InputError: a file is none of the release, or its tensors and settings do not fit each other.
     """
-    out, source, settings = new_output_path(out), Path(source), load_yaml(settings_file)
+    out, source, settings = new_output_path(out), Path(source), read_yaml(settings_file)
     try:
         imported = import_released(source, settings)
     except InputError as error:

@@ -303,10 +303,8 @@ def load_edits(path: str | Path, encode: Callable[[Path], Particles]) -> list[Ed
         InputError: names file, step and operation.
     """
     path = Path(path)
-    values = read_yaml(path, "edits")
-    if not isinstance(values, list):
-        raise InputError(f"edits: {path} must hold a list; got {type(values).__name__}")
-    return [_edit(value, f"{path}: edit {i}", path.parent, encode) for i, value in enumerate(values)]
+    values = enumerate(read_yaml(path, list))
+    return [_edit(value, f"{path}: edit {i}", path.parent, encode) for i, value in values]
 
 
 def _edit(values: Any, where: str, folder: Path, encode: Callable[[Path], Particles]) -> Edit:

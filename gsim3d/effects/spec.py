@@ -179,10 +179,7 @@ class EffectsSpec:
     @classmethod
     def load(cls, path: str | Path) -> EffectsSpec:
         """The spec of the YAML (or JSON) file ``path``."""
-        values = read_yaml(path, "effects")
-        if values is not None and not isinstance(values, dict):
-            raise InputError(f"effects: {path} must hold a mapping; got {type(values).__name__}")
-        return cls.from_dict(values)
+        return cls.from_dict(read_yaml(path, dict | None))
 
     @classmethod
     def of_scene(cls, folder: str | Path) -> EffectsSpec | None:

@@ -26,9 +26,9 @@ from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import CaptureError, InputError, NumericalError, did_you_mean
 from gsim3d.evaluate.protocol import horizon, score_scene
 from gsim3d.evaluate.report import summarize, write_json
-from gsim3d.io.files import MAX_TEXT, read_file, write_whole
+from gsim3d.io.files import MAX_TEXT, read_file, read_yaml, write_whole
 from gsim3d.io.plain import parse_json
-from gsim3d.io.settings import from_dict, load_yaml, to_dict
+from gsim3d.io.settings import from_dict, to_dict
 from gsim3d.train.config import TrainConfig
 from gsim3d.train.loop import Trainer
 from gsim3d.train.restore import model_config, restore
@@ -66,7 +66,7 @@ def load_ablations(path: Path = PAPER) -> tuple[dict[str, TrainConfig], dict[str
     """(base runs by preset, rows by name) of a file. Raises InputError: it is absent or holds something else."""
     if not path.is_file():
         raise InputError(f"{path}: does not exist; --table names a file as configs/ablations/paper.yaml is")
-    content = load_yaml(path)
+    content = read_yaml(path)
     if not isinstance(content.get("bases"), dict) or not isinstance(content.get("rows"), list):
         raise InputError(f"{path}: must hold bases and rows")
     rows = [from_dict(Row, row, f"{path}: rows[{n}]: ") for n, row in enumerate(content["rows"])]
@@ -121,7 +121,7 @@ def base_run(
     if config is None and preset not in bases:
         hint = did_you_mean(preset, bases)
         raise InputError(f"--preset: must be one of {', '.join(bases)}; got {preset!r}{hint}")
-    base = bases[preset] if config is None else from_dict(TrainConfig, load_yaml(config))
+    base = bases[preset] if config is None else from_dict(TrainConfig, read_yaml(config))
     return base if n_steps is None else with_steps(base, n_steps)
 
 

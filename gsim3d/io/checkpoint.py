@@ -31,9 +31,8 @@ from torch import Tensor
 
 from gsim3d import __version__
 from gsim3d.errors import InputError, NumericalError
-from gsim3d.io.files import MAX_TEXT, read_file, sha256_of
+from gsim3d.io.files import MAX_TEXT, read_file, read_yaml, sha256_of
 from gsim3d.io.plain import is_number
-from gsim3d.io.settings import load_yaml
 from gsim3d.pretrained import located
 
 FORMAT = 1
@@ -216,7 +215,7 @@ def _load_folder(path: Path) -> Checkpoint:
             raise InputError(f"{file}: missing, truncated or changed since it was written")
     if not {CONFIG, _WEIGHTS["model"]} <= set(hashes):
         raise InputError(f"{path}: the checkpoint holds no {CONFIG} or no {_WEIGHTS['model']}")
-    config = _known_format(load_yaml(path / CONFIG), path / CONFIG)
+    config = _known_format(read_yaml(path / CONFIG), path / CONFIG)
     tensors = {name: _read_tensors(path / file) if file in hashes else {} for name, file in _WEIGHTS.items()}
     return Checkpoint(config=config, state=state, digest=digest_of(path), **tensors)
 

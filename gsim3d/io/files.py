@@ -133,17 +133,25 @@ def read_file(path: str | Path, most: int, first: int | None = None) -> bytes:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
 
 
-def read_yaml(path: str | Path, subject: str) -> Any:
+def read_yaml(path: str | Path, kind: Any = dict) -> Any:
     """Plain values of a YAML (or JSON) file.
 
+    Args:
+        path: of the file.
+        kind: what it must hold: ``dict``, ``list``, or ``dict | None`` where it may be empty.
+
     Raises:
-        InputError: as :func:`read_file`, or it is none; the message starts with ``subject``.
+        InputError: as :func:`read_file`, it is no YAML, or it holds something else; the message names it.
     """
     text = read_file(path, MAX_TEXT)
     try:
-        return parse_yaml(text)
+        content = parse_yaml(text)
     except ValueError as error:
-        raise InputError(f"{subject}: {path} cannot be read: {error}") from None
+        raise InputError(f"{path} cannot be read: not valid YAML: {error}") from None
+    if not isinstance(content, kind):
+        wanted = "list" if kind is list else "mapping"
+        raise InputError(f"{path} must hold a {wanted}; got {type(content).__name__}")
+    return content
 
 
 def shown(value: Any) -> str:

@@ -5,27 +5,13 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
-from pathlib import Path
 from typing import Any, TypeVar
 
 from gsim3d.errors import InputError, did_you_mean
-from gsim3d.io.files import MAX_TEXT, read_file, shown
-from gsim3d.io.plain import is_number, parse_yaml
+from gsim3d.io.files import shown
+from gsim3d.io.plain import is_number
 
 T = TypeVar("T")
-
-
-def load_yaml(path: str | Path) -> dict:
-    """A YAML file that holds a mapping; plain data only."""
-    try:
-        content = parse_yaml(read_file(path, MAX_TEXT))
-    except InputError:
-        raise
-    except ValueError as error:
-        raise InputError(f"{path}: not valid YAML: {error}") from None
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: must hold a mapping of settings")
-    return content
 
 
 def to_dict(value: Any) -> Any:

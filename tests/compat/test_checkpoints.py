@@ -11,7 +11,8 @@ from gsim3d.compat.checkpoints import current_model, current_weights
 from gsim3d.compat.released_model import ReleasedModelConfig
 from gsim3d.dynamics import Dynamics, DynamicsConfig
 from gsim3d.errors import InputError
-from gsim3d.io.settings import from_dict, load_yaml, to_dict
+from gsim3d.io.files import read_yaml
+from gsim3d.io.settings import from_dict, to_dict
 
 ROOT = Path(__file__).parent.parent.parent
 
@@ -51,7 +52,7 @@ def test_sections_that_are_no_mappings_are_left_for_the_reader():
 
 
 def stored(model):
-    return load_yaml(ROOT / f"gsim3d/pretrained/{model}/config.yaml")["model"], load_file(
+    return read_yaml(ROOT / f"gsim3d/pretrained/{model}/config.yaml")["model"], load_file(
         ROOT / f"gsim3d/pretrained/{model}/model.safetensors"
     )
 
@@ -59,7 +60,7 @@ def stored(model):
 @pytest.mark.parametrize("world", ["elastic", "rigid", "cloth"])
 def test_switches_of_shipped_models_become_their_list_of_priors(world):
     section, _ = stored(f"{world}-small")
-    listed = load_yaml(ROOT / f"configs/priors/{world}.yaml")
+    listed = read_yaml(ROOT / f"configs/priors/{world}.yaml")
     base = presets.small().dynamics
     expected = from_dict(DynamicsConfig, listed, "dynamics", base).priors
     assert read(section).dynamics.priors == expected and "motion_length" in section["dynamics"]

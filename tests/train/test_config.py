@@ -16,7 +16,8 @@ from gsim3d.data import Fitting
 from gsim3d.effects.edits import load_edits
 from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError
-from gsim3d.io.settings import from_dict, load_yaml, to_dict, upgraded
+from gsim3d.io.files import read_yaml
+from gsim3d.io.settings import from_dict, to_dict, upgraded
 from gsim3d.priors import PriorConfig
 from gsim3d.train import restore
 from gsim3d.train.config import DataConfig, PhaseConfig, TrainConfig
@@ -96,10 +97,10 @@ def test_every_number_of_a_run_has_a_finite_range(tmp_path, text):
             content = {section: content}
         file.write_text(yaml.safe_dump(content))
         if (text, name) == ("huge", "seed"):
-            assert from_dict(TrainConfig, load_yaml(file)).seed == 2**62
+            assert from_dict(TrainConfig, read_yaml(file)).seed == 2**62
             continue
         with pytest.raises(InputError, match=rf"{name}:? must be|{name}: must be"):
-            from_dict(TrainConfig, load_yaml(file))
+            from_dict(TrainConfig, read_yaml(file))
 
 
 @pytest.mark.parametrize(
@@ -179,7 +180,7 @@ HOSTILE = {
 def test_hostile_files_end_with_one_short_line(tmp_path, name):
     content = HOSTILE[name]
     (tmp_path / "a.yaml").write_bytes(content if isinstance(content, bytes) else content.encode())
-    for read in (load_yaml, EffectsSpec.load, lambda path: load_edits(path, None)):
+    for read in (read_yaml, EffectsSpec.load, lambda path: load_edits(path, None)):
         with pytest.raises(InputError) as error:
             from_dict(TrainConfig, read(tmp_path / "a.yaml"))
         assert len(str(error.value)) < 600 + len(str(tmp_path)) and "\n" not in str(error.value)
@@ -187,7 +188,7 @@ def test_hostile_files_end_with_one_short_line(tmp_path, name):
 
 def test_numbers_as_yaml_writes_them(tmp_path):
     (tmp_path / "a.yaml").write_text("phases: [{steps: 5, learning_rate: 2e-4}]\n")
-    assert from_dict(TrainConfig, load_yaml(tmp_path / "a.yaml")).phases[0].learning_rate == 2e-4
+    assert from_dict(TrainConfig, read_yaml(tmp_path / "a.yaml")).phases[0].learning_rate == 2e-4
 
 
 @pytest.mark.parametrize(
@@ -196,9 +197,9 @@ def test_numbers_as_yaml_writes_them(tmp_path):
 def test_broken_files(tmp_path, content, message):
     (tmp_path / "a.yaml").write_text(content)
     with pytest.raises(InputError, match=message):
-        load_yaml(tmp_path / "a.yaml")
+        read_yaml(tmp_path / "a.yaml")
     with pytest.raises(InputError, match="cannot be read"):
-        load_yaml(tmp_path / "b.yaml")
+        read_yaml(tmp_path / "b.yaml")
 
 
 def test_optional_fixed_length_and_nested_fields():

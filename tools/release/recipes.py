@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from gsim3d.errors import InputError
-from gsim3d.io.settings import from_dict, load_yaml
+from gsim3d.io.files import read_yaml
+from gsim3d.io.settings import from_dict
 from gsim3d.synth.world import World
 from gsim3d.synth.worlds import VALIDATION_SEED, build_world
 from gsim3d.train.config import TrainConfig
@@ -58,15 +59,15 @@ def recipe(world: str, arm: str = "pure") -> Recipe:
     Raises:
         InputError: there is no such world or arm.
     """
-    arms = load_yaml(CONFIGS / "arms.yaml")
+    arms = read_yaml(CONFIGS / "arms.yaml")
     for given, known in ((world, WORLDS), (arm, arms)):
         if given not in known:
             raise InputError(f"{given!r} is not known; choose from {', '.join(known)}")
-    settings = load_yaml(CONFIGS / f"{world}.yaml")
+    settings = read_yaml(CONFIGS / f"{world}.yaml")
     for part in ("all", world):
         settings = merged(settings, arms[arm].get(part, {}))
     if arm == "priors":
-        settings = merged(settings, {"model": {"dynamics": load_yaml(CONFIGS.parent / "priors" / f"{world}.yaml")}})
+        settings = merged(settings, {"model": {"dynamics": read_yaml(CONFIGS.parent / "priors" / f"{world}.yaml")}})
     return Recipe(f"{world}-{arm}", world, from_dict(TrainConfig, settings))
 
 

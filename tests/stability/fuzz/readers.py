@@ -37,7 +37,8 @@ from gsim3d.evaluate.perceptual import weights
 from gsim3d.evaluate.plan_report import TIMES, load_times
 from gsim3d.evaluate.predictions import Predictions
 from gsim3d.io import checkpoint, read_ply, read_splats, write_ply, write_splats
-from gsim3d.io.settings import from_dict, load_yaml, to_dict
+from gsim3d.io.files import read_yaml
+from gsim3d.io.settings import from_dict, to_dict
 from gsim3d.numerics.speed import load_speed
 from gsim3d.simulator import Simulator
 from gsim3d.state import Gaussians
@@ -165,7 +166,7 @@ def _write_release(folder: Path) -> None:
 
 
 def _read_release(folder: Path, what: str) -> None:
-    import_released(folder / "model.ckpt", load_yaml(folder / "model.yaml"))
+    import_released(folder / "model.ckpt", read_yaml(folder / "model.yaml"))
 
 
 def _gaussians() -> Gaussians:
@@ -375,7 +376,7 @@ READERS = {
     "log": Reader(_write_log, lambda folder, what: Log(folder).cut(2)),
     "train_yaml": Reader(
         lambda folder: (folder / "train.yaml").write_text(yaml.safe_dump(TRAINING)),
-        lambda folder, what: from_dict(TrainConfig, load_yaml(folder / "train.yaml")),
+        lambda folder, what: from_dict(TrainConfig, read_yaml(folder / "train.yaml")),
     ),
     "effects": Reader(
         lambda folder: EffectsSpec.from_dict({"dynamics": {"background": "masked_out", "history": 2}}).save(
