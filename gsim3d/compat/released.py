@@ -11,6 +11,7 @@ import re
 import torch
 from torch import Tensor
 
+from gsim3d.compat.released_harmonics import published_axes
 from gsim3d.dynamics.step import StateLayout
 from gsim3d.math.spherical_harmonics import rotate_harmonics
 from gsim3d.presets import ModelConfig
@@ -62,6 +63,7 @@ _ENCODER = [
     ("depth_predictor.to_gaussians", "heads.to_gaussians"),
     ("depth_predictor.global_cond", "heads.conditioning.net"),
 ]
+_HEAD = [("to_missing_3dgs.0", "fc1"), ("to_missing_3dgs.2", "fc2")]
 LATENTS = [f"depth_predictor.to_mono_features.{kind}_latent_features." for kind in ("dynamic", "static")]
 
 
@@ -82,10 +84,9 @@ def _reversed(pairs: list[tuple[str, str]]) -> list[tuple[str, str]]:
 
 def encoder_weights(published: dict[str, Tensor]) -> dict[str, Tensor]:
     """State dict below "encoder." -> that of :class:`gsim3d.nn.multiview_encoder.Encoder`."""
-    weights = {}
-    for name, value in published.items():
-        if not name.startswith(tuple(LATENTS)):
-            weights[_rename(name, _ENCODER)] = value
+    weights = {
+        _rename(name, _ENCODER): value for name, value in published.items() if not name.startswith(tuple(LATENTS))
+    }
     for kind in ("weight", "bias"):
         parts = [published[prefix + kind] for prefix in LATENTS if prefix + kind in published]
         if parts:
@@ -100,13 +101,8 @@ def dynamics_weights(published: dict[str, Tensor]) -> dict[str, Tensor]:
 
 def head_weights(published: dict[str, Tensor]) -> dict[str, Tensor]:
     """State dict below "decoder." -> that of :class:`gsim3d.nn.gaussian_head.GaussianHead`."""
-    weight = published["to_missing_3dgs.2.weight"]
-    return {
-        "fc1.weight": published["to_missing_3dgs.0.weight"],
-        "fc1.bias": published["to_missing_3dgs.0.bias"],
-        "fc2.weight": weight,
-        "fc2.bias": torch.zeros_like(weight[:, 0]),
-    }
+    weights = {_rename(name, _HEAD): value for name, value in published.items()}
+    return weights | {"fc2.bias": torch.zeros_like(weights["fc2.weight"][:, 0])}
 
 
 def from_published(published: dict[str, Tensor], config: ModelConfig) -> dict[str, Tensor]:
@@ -140,7 +136,7 @@ def to_published(weights: dict[str, Tensor], config: ModelConfig) -> dict[str, T
             published[name.replace("running_mean", _COUNTER)] = counter
     for name, value in _below(weights, "renderer.").items():
         if name != "fc2.bias":
-            published[HEAD + {"fc1": "to_missing_3dgs.0", "fc2": "to_missing_3dgs.2"}[name[:3]] + name[3:]] = value
+            published[HEAD + _rename(name, _reversed(_HEAD))] = value
     return published
 
 
@@ -149,34 +145,27 @@ def harmonics_matrix(degree: int) -> Tensor:
 
     The published basis is the standard one of (z, x, y) instead of (x, y, z). The matrix is orthogonal.
     """
-    permute = torch.eye(3, dtype=torch.float64)[[2, 0, 1]]
     each = torch.eye((degree + 1) ** 2, dtype=torch.float64)
-    return rotate_harmonics(each[None], permute.T[None])[0]
+    return rotate_harmonics(each[None], published_axes(each).T[None])[0]
 
 
 def _change_basis(weights: dict[str, Tensor], config: ModelConfig, matrix: Tensor) -> dict[str, Tensor]:
     """Weights of dynamics that see harmonics c as ``matrix @ c``."""
     layout = StateLayout.of(config.dynamics)
     wide = torch.block_diag(*[matrix] * 3)  # of the channels (3, K)
-    for names, fields, axis, repeats in (
-        (["stem.conv.weight"], layout.inputs, -1, 1),
-        (["head.fc2.weight", "head.fc2.bias"], layout.outputs, 0, config.dynamics.steps_per_call),
+    for name, fields, axis, repeats in (
+        ("stem.conv.weight", layout.inputs, -1, 1),
+        ("head.fc2.weight", layout.outputs, 0, config.dynamics.steps_per_call),
+        ("head.fc2.bias", layout.outputs, 0, config.dynamics.steps_per_call),
     ):
-        first, width, total = _columns("sh", fields)
-        for name in names:
-            after = weights[f"dynamics.net.{name}"].clone()
-            for start in range(first, repeats * total, total):
-                part = after.narrow(axis, start, width).movedim(axis, -1)
-                part.copy_(part.double() @ wide.T.to(part.device))
-            weights[f"dynamics.net.{name}"] = after
+        names, widths = zip(*fields, strict=True)
+        place = names.index("sh")
+        after = weights[f"dynamics.net.{name}"].clone()
+        for start in range(sum(widths[:place]), repeats * sum(widths), sum(widths)):
+            part = after.narrow(axis, start, widths[place]).movedim(axis, -1)
+            part.copy_(part.double() @ wide.T.to(part.device))
+        weights[f"dynamics.net.{name}"] = after
     return weights
-
-
-def _columns(field: str, fields: tuple[tuple[str, int], ...]) -> tuple[int, int, int]:
-    """First channel and width of a field, and the width of all."""
-    names, widths = zip(*fields, strict=True)
-    place = names.index(field)
-    return sum(widths[:place]), widths[place], sum(widths)
 
 
 def _below(weights: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

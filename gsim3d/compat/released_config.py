@@ -84,43 +84,43 @@ class _Settings:
             value = value[key]
         return value
 
+    def _check(self, good: bool, path: str, what: str, value: Any) -> None:
+        if not good:
+            raise InputError(f"{path}: must be {what}; got {shown(value)}")
+
     def number(self, path: str, default: Any = NO_MEANING) -> float:
         value = self.get(path, default)
         if isinstance(value, str) and re.fullmatch(r"-?\d+[eE][-+]?\d+", value):  # YAML 1.1 reads 4e-3 as text
             value = float(value)
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-            raise InputError(f"{path}: must be a number; got {shown(value)}")
+        self._check(type(value) in (int, float) and math.isfinite(value), path, "a number", value)
         return float(value)
 
-    def positive(self, path: str, default: Any = NO_MEANING) -> float:
-        value = self.number(path, default)
-        if value <= 0:
-            raise InputError(f"{path}: must be above 0; got {shown(value)}")
+    def positive(self, path: str) -> float:
+        value = self.number(path)
+        self._check(value > 0, path, "above 0", value)
         return value
 
     def whole(self, path: str, default: Any = NO_MEANING) -> int:
         value = self.get(path, default)
-        if isinstance(value, bool) or not isinstance(value, int):
-            raise InputError(f"{path}: must be a whole number; got {shown(value)}")
+        self._check(type(value) is int, path, "a whole number", value)
         return value
 
     def flag(self, path: str, default: Any = NO_MEANING) -> bool:
         value = self.get(path, default)
-        if not isinstance(value, bool):
-            raise InputError(f"{path}: must be true or false; got {shown(value)}")
+        self._check(isinstance(value, bool), path, "true or false", value)
         return value
 
-    def wholes(self, path: str, count: int | None = None, default: Any = NO_MEANING) -> tuple[int, ...]:
-        value = self.get(path, default)
+    def wholes(self, path: str, count: int | None = None) -> tuple[int, ...]:
+        value = self.get(path)
         good = isinstance(value, list) and all(type(n) is int and 0 < n < 2**20 for n in value)
-        if not good or (count is not None and len(value) != count):
-            raise InputError(f"{path}: must be a list of {count or 'any number of'} whole numbers; got {shown(value)}")
+        good = good and count in (None, len(value))
+        self._check(good, path, f"a list of {count or 'any number of'} whole numbers", value)
         return tuple(value)
 
     def names(self, path: str) -> set[str]:
         value = self.get(path)
-        if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
-            raise InputError(f"{path}: must be a list of names; got {shown(value)}")
+        good = isinstance(value, list) and all(isinstance(name, str) for name in value)
+        self._check(good, path, "a list of names", value)
         return set(value)
 
     def unread(self) -> list[str]:
@@ -188,11 +188,11 @@ def read_config(content: dict, shapes: Shapes) -> ReleasedConfig:
     )
     sh_degree = _sh_degree(sizes, explicit)
     updates = _updates(settings, sizes, explicit, n_dynamic, sh_degree)
-    common = dict(explicit=explicit, sh_degree=sh_degree)
+    common = {"explicit": explicit, "sh_degree": sh_degree}
     history = settings.whole("dataset.n_step_state")
     if history not in HISTORIES:
         raise InputError(f"dataset.n_step_state: must be {', '.join(map(str, HISTORIES))}; got {history}")
-    scale_min, scale_max = (settings.positive(f"model.state_adapter.gaussians.scale_{end}") for end in ("min", "max"))
+    scales = {f"scale_{end}": settings.positive(f"model.state_adapter.gaussians.scale_{end}") for end in ("min", "max")}
     try:
         encoder = EncoderConfig(**_encoder(settings, sizes), dynamic_dim=n_dynamic, static_dim=n_static, **common)
         dynamics = ReleasedDynamicsConfig(
@@ -200,18 +200,12 @@ def read_config(content: dict, shapes: Shapes) -> ReleasedConfig:
             **updates,
             dynamic_latents=n_dynamic,
             static_latents=n_static,
-            scale_min=scale_min,
-            scale_max=scale_max,
             history_bits=history.bit_length() - 1,
+            **scales,
             **common,
         )
-        renderer = RendererConfig(
-            latents=0 if explicit else n_dynamic + n_static,
-            sh_degree=sh_degree,
-            scale_min=scale_min,
-            scale_max=scale_max,
-            jacobian="clamped",
-        )
+        latents = 0 if explicit else n_dynamic + n_static
+        renderer = RendererConfig(latents=latents, sh_degree=sh_degree, jacobian="clamped", **scales)
         model = ReleasedModelConfig(encoder, dynamics, renderer)
     except ValueError as error:
         raise InputError(f"the settings and the weights do not make a model: {error}") from None
@@ -229,19 +223,17 @@ def _is_explicit(settings: _Settings, sizes: _Sizes) -> bool:
             f"got {', '.join(sorted(params))}"
         )
     if explicit != (params == EXPLICIT):
-        kind = {True: "explicit", False: "latent"}
+        said, found = ("latent", "explicit") if explicit else ("explicit", "latent")
         raise InputError(
-            f"model.state_adapter.state_3dgs_params describes the {kind[not explicit]} variant, but the weights are of "
-            f"the {kind[explicit]} one: this configuration belongs to another checkpoint"
+            f"model.state_adapter.state_3dgs_params describes the {said} variant, but the weights are of the {found} "
+            "one: this configuration belongs to another checkpoint"
         )
     return explicit
 
 
 def _sh_degree(sizes: _Sizes, explicit: bool) -> int:
-    if explicit:
-        n_harmonics = (sizes.needed(f"{ENCODER}depth_predictor.to_gaussians.2.weight") - 9) / 3
-    else:
-        n_harmonics = (sizes.needed(f"{HEAD}to_missing_3dgs.2.weight") - 7) / 3
+    layer, others = (f"{ENCODER}depth_predictor.to_gaussians.2", 9) if explicit else (f"{HEAD}to_missing_3dgs.2", 7)
+    n_harmonics = (sizes.needed(f"{layer}.weight") - others) / 3
     degree = next((d for d in range(MAX_SH_DEGREE + 1) if (d + 1) ** 2 == n_harmonics), None)
     if degree is None:
         raise InputError(f"weights: colours have {n_harmonics:g} coefficients; supported are 1, 4, 9 and 16")
@@ -330,18 +322,13 @@ def _n_stages(sizes: _Sizes) -> int:
 def _dynamics(settings: _Settings, sizes: _Sizes) -> dict[str, Any]:
     net = "model.dynamic_model.model"
     n = _n_stages(sizes)
-    named = {"enc": range(n), "dec": range(n - 1)}
-    depths = {
-        side: tuple(sizes.count(rf"{re.escape(DYNAMICS)}{side}\.{side}{s}\.block(\d+)\.") for s in stages)
-        for side, stages in named.items()
-    }
-    channels = {
-        side: tuple(sizes.of(f"{DYNAMICS}{side}.{side}{s}.block0.norm1.0.weight") for s in stages)
-        for side, stages in named.items()
-    }
-    for side in named:
-        sizes.agreed(f"{net}.{side}_depths", list(depths[side]))
-        sizes.agreed(f"{net}.{side}_channels", list(channels[side]))
+    depths, channels = {}, {}
+    for side, n_here in (("enc", n), ("dec", n - 1)):
+        stages = [f"{DYNAMICS}{side}.{side}{s}.block" for s in range(n_here)]
+        found = [sizes.count(rf"{re.escape(stage)}(\d+)\.") for stage in stages]
+        depths[side] = tuple(sizes.agreed(f"{net}.{side}_depths", found))
+        found = [sizes.of(f"{stage}0.norm1.0.weight") for stage in stages]
+        channels[side] = tuple(sizes.agreed(f"{net}.{side}_channels", found))
     time_embedding = settings.flag(f"{net}.with_time_emb", True)
     windows = settings.wholes(f"{net}.merge_window_size", n - 1)
     if time_embedding:
@@ -380,7 +367,6 @@ def _data(settings: _Settings, history: int, size_multiple: int) -> tuple[dict[s
     near, far = settings.positive("dataset.near"), settings.positive("dataset.far")
     if far <= near:
         raise InputError(f"dataset.far: must lie beyond near; got near {near} and far {far}")
-    unit_cameras = settings.flag("dataset.make_baseline_1", False)
     if settings.flag("dataset.baseline_scale_bounds", False):
         raise InputError("dataset.baseline_scale_bounds: depth bounds that change with the scene are not supported")
     if width % size_multiple or height % size_multiple:
@@ -392,7 +378,7 @@ def _data(settings: _Settings, history: int, size_multiple: int) -> tuple[dict[s
         "image_size": [width, height],
         "resize": [width, height],
         "near_far": [near, far],
-        "unit_cameras": unit_cameras,
+        "unit_cameras": settings.flag("dataset.make_baseline_1", False),
     }
     with_seg = settings.flag("dataset.with_seg", False)
     effects = EffectsSpec(dynamics=DynamicsEffects(background="frozen" if with_seg else "dynamic"))

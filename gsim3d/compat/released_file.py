@@ -64,34 +64,20 @@ class StoredTensor:
     @property
     def end(self) -> int:
         """One past the last element of the storage that the tensor uses."""
-        if self.n_elements == 0:
-            return self.offset
-        return self.offset + sum((n - 1) * step for n, step in zip(self.shape, self.stride, strict=True)) + 1
+        last = sum((n - 1) * step for n, step in zip(self.shape, self.stride, strict=True))
+        return self.offset + (last + 1 if self.n_elements else 0)
 
 
 class Ignored:
     """Stands for an object that is not needed; takes whatever it is given and keeps nothing."""
 
-    def __new__(cls, *args, **kwargs):
-        return object.__new__(cls)
-
-    def __init__(self, *args, **kwargs):
-        pass
-
     def __call__(self, *args, **kwargs):
         return self
 
-    def __setitem__(self, key, value):
+    def _ignore(self, *args, **kwargs):
         pass
 
-    def __setstate__(self, state):
-        pass
-
-    def append(self, value):
-        pass
-
-    def extend(self, values):
-        pass
+    __init__ = __setitem__ = __setstate__ = append = extend = _ignore
 
 
 class _Table(dict):
@@ -108,14 +94,8 @@ class _Unpickler(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         full = f"{module}.{name}".replace("__builtin__.", "builtins.")  # torch.save writes Python 2's names
-        if full == "collections.OrderedDict":
-            return _Table
-        if full == "torch._utils._rebuild_tensor_v2":
-            return _stored_tensor
-        if full == "torch._utils._rebuild_parameter":
-            return _stored_parameter
-        if module == "torch" and name in _DTYPES:
-            return _DTYPES[name]
+        if full in _KNOWN:
+            return _KNOWN[full]
         if full in _PLACEHOLDER_NAMES or module.split(".")[0] in _PLACEHOLDER_PACKAGES:
             return Ignored
         raise InputError(
@@ -138,8 +118,12 @@ def _stored_tensor(storage, offset, shape, stride, *_) -> StoredTensor:
     return StoredTensor(key, dtype, offset, tuple(shape), tuple(stride))
 
 
-def _stored_parameter(data, *_) -> StoredTensor:
-    return data
+_KNOWN = {
+    "collections.OrderedDict": _Table,
+    "torch._utils._rebuild_tensor_v2": _stored_tensor,
+    "torch._utils._rebuild_parameter": lambda data, *_: data,
+    **{f"torch.{name}": dtype for name, dtype in _DTYPES.items()},
+}
 
 
 class ReleasedFile:

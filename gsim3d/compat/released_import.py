@@ -104,9 +104,8 @@ def check_shapes(found: Shapes, expected: Shapes, where: Path) -> None:
     ]
     unexpected = [name for name in found if name not in expected]
     if missing or wrong:
-        parts = [f"{len(missing)} missing: {_few(missing)}"] if missing else []
-        parts += [f"{len(wrong)} of another shape: {_few(wrong)}"] if wrong else []
-        parts += [f"{len(unexpected)} unexpected: {_few(unexpected)}"] if unexpected else []
+        groups = {"missing": missing, "of another shape": wrong, "unexpected": unexpected}
+        parts = [f"{len(group)} {what}: {_few(group)}" for what, group in groups.items() if group]
         raise InputError(f"{where}: its tensors do not fit the configuration; {'; '.join(parts)}")
 
 
@@ -122,12 +121,10 @@ def untrained_signs(published: dict[str, Tensor]) -> UntrainedSigns:
     """
     blocks = {match[1] for name in published if (match := re.match(rf"{re.escape(DYNAMICS)}(.*\.block\d+)\.", name))}
     untrained = [block for block in blocks if _drawn_block(published, f"{DYNAMICS}{block}.")]
-    heads = [f"{ENCODER}{prefix}" for prefix in LATENTS] + [
-        f"{ENCODER}depth_predictor.global_cond.{i}." for i in (0, 2)
-    ]
-    heads = [head for head in heads if f"{head}weight" in published]
-    drawn = all(_drawn_layer(published, head) for head in heads)
-    return UntrainedSigns(len(untrained), len(blocks), drawn if heads else None)
+    layers = [*LATENTS, "depth_predictor.global_cond.0.", "depth_predictor.global_cond.2."]
+    heads = [f"{ENCODER}{layer}" for layer in layers if f"{ENCODER}{layer}weight" in published]
+    drawn = all(_drawn_layer(published, head) for head in heads) if heads else None
+    return UntrainedSigns(len(untrained), len(blocks), drawn)
 
 
 def _drawn_block(published: dict[str, Tensor], prefix: str) -> bool:

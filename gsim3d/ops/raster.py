@@ -121,40 +121,26 @@ def rasterize_gaussians(
         >>> image.color.shape, bool(image.alpha[0, 4, 4] > 0.7)
         (torch.Size([1, 8, 8, 3]), True)
     """
-    if not torch.compiler.is_compiling():
+    compiling = torch.compiler.is_compiling()
+    rows = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
+    if not compiling:
         optional = {"sh": sh, "colors": colors, "features": features, "background": background, "cu_rows": cu_rows}
-        tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
-        _check_arguments(tensors, {k: v for k, v in optional.items() if v is not None}, cameras, near_plane)
-    if (sh is None) == (colors is None):
-        raise ValueError("rasterize_gaussians: give one of sh and colors")
-    if not isinstance(cutoff, str) or cutoff not in CUTOFFS:
-        raise ValueError(f"rasterize_gaussians: cutoff must be one of {', '.join(CUTOFFS)}; got {cutoff!r}")
-    if not isinstance(jacobian, str) or jacobian not in JACOBIANS:
-        raise ValueError(f"rasterize_gaussians: jacobian must be one of {', '.join(JACOBIANS)}; got {jacobian!r}")
-    color = sh if colors is None else colors
-    dims = 3 if colors is None else 2
-    if color.dim() != dims:
-        name, wanted = ("sh", "[N, K, 3]") if colors is None else ("colors", "[N, 3]")
-        raise ValueError(f"rasterize_gaussians: {name} must be {wanted}; got {list(color.shape)}")
+        _check_arguments(rows, {k: v for k, v in optional.items() if v is not None}, cameras, near_plane)
+    _check_choices(sh, colors, cutoff, jacobian)
     check_on_invalid(on_invalid)
-    features_given = means.new_empty(means.shape[0], 0) if features is None else features
-    color_name = "sh" if colors is None else "colors"
-    names = ("means", "quats", "scales", "opacities", color_name, "features")
-    rows = (means, quats, scales, opacities, color, features_given)
+    n, n_images = means.shape[0], cameras.viewmats.shape[0]
+    rows |= {"sh": sh} if colors is None else {"colors": colors}
+    rows["features"] = means.new_empty(n, 0) if features is None else features
     if on_invalid == "clamp":
-        _check_rows(dict(zip(names, rows, strict=True)))
-        rows = _clamped(dict(zip(names, rows, strict=True)), report).values()
-    n_images = cameras.viewmats.shape[0]
+        _check_rows(rows)
+        rows = _clamped(rows, report)
     real = torch.float64 if means.dtype == torch.float64 else torch.float32
-    if background is None:
-        background = means.new_zeros(n_images, 3, dtype=real)
-    elif background.dim() == 1:
-        background = background.expand(n_images, -1)
     if cu_rows is None:
-        cu_rows = torch.tensor([0, means.shape[0]], device=means.device)
+        cu_rows = torch.tensor([0, n], device=means.device)
+    watch = not compiling and (report is not None or (on_invalid == "raise" and means.device.type == "cpu"))
     args = (
-        *rows,
-        background,
+        *rows.values(),
+        _of_each_image(background, n_images, means, real),
         cameras.viewmats.to(real),
         cameras.Ks.to(real),
         cameras.image_cloud,
@@ -165,19 +151,25 @@ def rasterize_gaussians(
         CUTOFFS[cutoff],
         JACOBIANS[jacobian],
         *_sizes_of_state(means, n_images, cu_rows.shape[0] - 1, cameras.width, cameras.height),
+        watch,
     )
-    raises = on_invalid == "raise" and means.device.type == "cpu"
-    watch = (raises or report is not None) and not torch.compiler.is_compiling()
-    if torch.compiler.is_compiling():
-        out = torch.ops.gsim3d.rasterize_gaussians(*args, watch)
+    if compiling:
+        out = torch.ops.gsim3d.rasterize_gaussians(*args)
     else:
         size = f"cameras.width={cameras.width}, cameras.height={cameras.height}"
-        out = within_memory(OP, size, torch.ops.gsim3d.rasterize_gaussians, *args, watch)
+        out = within_memory(OP, size, torch.ops.gsim3d.rasterize_gaussians, *args)
     if watch:
         action = "error" if on_invalid == "raise" else "dropped"
-        read = partial(_unusable, names=(*names, "scales", "scales", "cameras"), action=action)
+        read = partial(_unusable, names=(*rows, "scales", "scales", "cameras"), action=action)
         (StabilityReport() if report is None else report).record(out[7], read, counts=range(0, out[7].numel(), 2))
     return Rendering(out[0], out[1], out[2], None if features is None else out[3])
+
+
+def _of_each_image(background: Tensor | None, n_images: int, means: Tensor, dtype: torch.dtype) -> Tensor:
+    """[I, 3]; black where there is no background."""
+    if background is None:
+        return means.new_zeros(n_images, 3, dtype=dtype)
+    return background.expand(n_images, -1) if background.dim() == 1 else background
 
 
 def _unusable(numbers: Tensor, names: Sequence[str], action: str) -> Reading:
@@ -229,6 +221,17 @@ def _check_arguments(rows: dict[str, Tensor], optional: dict[str, Tensor], camer
         value = rows.get(name, of_cameras.get(name, optional.get(name)))
         if value is not None and value.dim() != shape.count(",") + 1:
             raise ValueError(f"rasterize_gaussians: {name} must be {shape}; got {list(value.shape)}")
+
+
+def _check_choices(sh: Tensor | None, colors: Tensor | None, cutoff: str, jacobian: str) -> None:
+    if (sh is None) == (colors is None):
+        raise ValueError("rasterize_gaussians: give one of sh and colors")
+    for name, value, known in (("cutoff", cutoff, CUTOFFS), ("jacobian", jacobian, JACOBIANS)):
+        if not isinstance(value, str) or value not in known:
+            raise ValueError(f"rasterize_gaussians: {name} must be one of {', '.join(known)}; got {value!r}")
+    name, color, shape = ("sh", sh, "[N, K, 3]") if colors is None else ("colors", colors, "[N, 3]")
+    if color.dim() != shape.count(",") + 1:
+        raise ValueError(f"rasterize_gaussians: {name} must be {shape}; got {list(color.shape)}")
 
 
 def _check_rows(rows: dict[str, Tensor]) -> None:
