@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -47,10 +48,9 @@ class Finding:
     camera: int | None = None
 
     def __str__(self) -> str:
-        location = [
-            f"{name} {value}" for name in ("scene", "step", "camera") if (value := getattr(self, name)) is not None
-        ]
-        location = f" ({', '.join(location)})" if location else ""
+        location = {"scene": self.scene, "step": self.step, "camera": self.camera}
+        location = ", ".join(f"{name} {value}" for name, value in location.items() if value is not None)
+        location = f" ({location})" if location else ""
         row = "" if self.row is None else f" at row {self.row}"
         more = f" and {self.count - 1} more" if self.count > 1 else ""
         return f"{self.where}: {self.tensor}: {self.what}{row}{location}{more}"
@@ -149,7 +149,7 @@ class StabilityReport:
 
     def clear(self) -> None:
         """Forgets everything."""
-        self._found: dict[tuple, Finding] = {}
+        self._found: dict[Finding, Finding] = {}
         self._total = 0
         self._errors: list[Finding] = []
         self._first_error: Finding | None = None
@@ -169,17 +169,15 @@ class StabilityReport:
 
     def add(self, finding: Finding) -> None:
         """Counts ``finding``; those of the same kind and location become one."""
-        key = (finding.what, finding.where, finding.tensor, finding.action)
-        key += (finding.scene, finding.step, finding.camera)
+        key = dataclasses.replace(finding, count=0, row=None)
         with self._lock:
             self._total += finding.count
             if finding.action == "error":
                 self._errors.append(finding)  # of this call alone, whose rows its message counts
                 self._first_error = self._first_error or finding
-            known = self._found.get(key)
-            if known is not None:
-                finding = Finding(*key[:4], known.count + finding.count, known.row, *key[4:])
-            if known is not None or len(self._found) < MAX_FINDINGS:
+            if known := self._found.get(key):
+                self._found[key] = dataclasses.replace(known, count=known.count + finding.count)
+            elif len(self._found) < MAX_FINDINGS:
                 self._found[key] = finding
 
     def record(

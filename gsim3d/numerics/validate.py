@@ -40,15 +40,14 @@ class _Checks(NamedTuple):
 
 
 def _checks(names: tuple[str, ...], config: StabilityConfig, max_opacity: float) -> _Checks:
-    limits = {
-        "means": (-LARGEST, LARGEST),
-        "opacities": (0.0, max_opacity),
-        "quats": (-LARGEST, LARGEST),
-        "scales": (0.0, LARGEST),
-    }
+    any_size = -LARGEST, LARGEST
+    limits = {"means": any_size, "opacities": (0.0, max_opacity), "quats": any_size, "scales": (0.0, LARGEST)}
     bounds = [limits.get(name, (-config.max_latent, config.max_latent)) for name in names]
     action, by_rule = ACTIONS[config.on_invalid], "clamped" if config.on_invalid == "clamp" else "asleep"
-    kinds = [(f"particles.{name}", BOUNDED.get(name) or _what(high), action) for name, (_, high) in zip(names, bounds)]
+    kinds = []
+    for name, (_, high) in zip(names, bounds, strict=True):
+        what = "not finite" if high == LARGEST else f"not finite or beyond {high:g}"
+        kinds.append((f"particles.{name}", BOUNDED.get(name, what), action))
     kinds += [("particles.means", "outside the workspace", by_rule), ("particles.means", "speed limit", by_rule)]
     return _Checks(bounds, kinds, [float(name == "quats") for name in names])
 
@@ -96,7 +95,9 @@ def validate_particles(
     clamps = config.on_invalid == "clamp"
     on_gpu = particles.means.is_cuda and not torch.compiler.is_compiling()  # the report gets its record later
     # the copies that the kernel sanitizes carry no gradients
-    in_kernel = not clamps and not (torch.is_grad_enabled() and _have_gradients(fields.values(), before or ()))
+    in_kernel = not clamps and not (
+        torch.is_grad_enabled() and any(value.requires_grad for value in (*fields.values(), *(before or ())))
+    )
     validated = validate_state(
         list(fields.values()),
         checks.bounds,
@@ -122,8 +123,15 @@ def validate_particles(
                 _validate_gradients(fields.values(), read(validated.record).findings[0], report)
     if validated.fields is not None:
         return _with_fields(particles, dict(zip(fields, validated.fields)) | {"activity": validated.activity})
-    sanitize = _clamp if clamps else _put_to_sleep
-    return sanitize(particles, fields, checks.bounds, validated.status, config, grid_size, previous)
+    replacements = before or [_neutral(name, particles) for name in fields]
+    if not clamps:
+        return _put_to_sleep(particles, fields, replacements, validated.status)
+    clamped = {
+        name: torch.where(value.isnan(), replacement, value).clamp(low, high)
+        for (name, value), replacement, (low, high) in zip(fields.items(), replacements, checks.bounds, strict=True)
+    }
+    means = _clamped_means(clamped["means"], particles, validated.status, config.max_speed, grid_size, previous)
+    return dataclasses.replace(particles, **clamped | {"means": means})
 
 
 def validate_frames(
@@ -235,10 +243,6 @@ def _read_images(frames: Frames, where: str, action: str, counts: Tensor) -> Rea
     return Reading(findings, {})
 
 
-def _what(high: float) -> str:
-    return "not finite" if high == LARGEST else f"not finite or beyond {high:g}"
-
-
 def _read(clouds: CloudTable, where: str, checks: _Checks, moved: bool, record: Tensor) -> Reading:
     """The content of a record of the kernel."""
     findings, statistics, n_counts = [], {}, 2 * len(checks.kinds)
@@ -268,10 +272,6 @@ def _with_fields(particles: Particles, fields: dict[str, Tensor]) -> Particles:
     made = object.__new__(Particles)
     vars(made).update(vars(particles), **fields)
     return made
-
-
-def _have_gradients(*groups: Iterable[Tensor]) -> bool:
-    return any(value.requires_grad for group in groups for value in group)
 
 
 def _validate_gradients(values: Iterable[Tensor], finding: Finding, report: StabilityReport) -> None:
@@ -311,32 +311,32 @@ def _neutral(name: str, particles: Particles) -> Tensor:
     return neutral
 
 
-def _put_to_sleep(particles, fields, bounds, status, config, grid_size, previous) -> Particles:
+def _put_to_sleep(
+    particles: Particles, fields: dict[str, Tensor], replacements: list[Tensor], status: Tensor
+) -> Particles:
     unusable, stays = status & (OUTSIDE - 1) != 0, status & (OUTSIDE - 1 | FAST) == 0
     sanitized = {}
-    for name, value in fields.items():
-        before = _neutral(name, particles) if previous is None else getattr(previous, name)
-        if before is not value:
-            sanitized[name] = torch.where(stays.reshape(-1, *[1] * (value.dim() - 1)), value, before)
+    for (name, value), replacement in zip(fields.items(), replacements, strict=True):
+        if replacement is not value:
+            sanitized[name] = torch.where(stays.reshape(-1, *[1] * (value.dim() - 1)), value, replacement)
     opacities = sanitized.get("opacities", particles.opacities)
     sanitized["opacities"] = torch.where(unusable, 0.0, opacities)
     sanitized["activity"] = torch.where(status == 0, particles.activity, ASLEEP)
     return dataclasses.replace(particles, **sanitized)
 
 
-def _clamp(particles, fields, bounds, status, config, grid_size, previous) -> Particles:
-    sanitized = {}
-    for (name, value), (low, high) in zip(fields.items(), bounds, strict=True):
-        before = _neutral(name, particles) if previous is None else getattr(previous, name)
-        sanitized[name] = torch.where(value.isnan(), before, value).clamp(low, high)
+def _clamped_means(
+    means: Tensor, particles: Particles, status: Tensor, max_speed: float, grid_size: float, previous: Particles | None
+) -> Tensor:
+    """Positions, finite ones, at the limit of the speed and inside of the workspace."""
     if previous is not None:
-        step = sanitized["means"] - previous.means
+        step = means - previous.means
         length = step.double().norm(dim=1, keepdim=True)
-        share = (config.max_speed / length.clamp(min=config.max_speed)).to(step)
-        sanitized["means"] = torch.where(status[:, None] & FAST != 0, previous.means + share * step, sanitized["means"])
+        share = (max_speed / length.clamp(min=max_speed)).to(step)
+        means = torch.where(status[:, None] & FAST != 0, previous.means + share * step, means)
     if grid_size > 0:
         origin = particles.origin[particles.cloud_scene[particles.row_cloud()]]
-        inside = (sanitized["means"].double() - origin).clamp(0, (CELLS - 0.5) * grid_size)
+        inside = (means.double() - origin).clamp(0, (CELLS - 0.5) * grid_size)
         outside = status[:, None] & (OUTSIDE | FAST | 1) != 0
-        sanitized["means"] = torch.where(outside, (origin + inside).to(sanitized["means"]), sanitized["means"])
-    return dataclasses.replace(particles, **sanitized)
+        means = torch.where(outside, (origin + inside).to(means), means)
+    return means
