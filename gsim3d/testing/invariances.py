@@ -11,8 +11,9 @@ step, each from one state; exact ones are checked on the whole rollout.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -131,8 +132,7 @@ def select_images(frames: Frames, images: Tensor, image_cloud: Tensor | None = N
     """``frames`` with ``images`` (int64 [J]) only, in that order, of the clouds ``image_cloud`` (None: as before)."""
     maps = {name: getattr(frames, name) for name in ("images", "masks", "dynamic", "valid")}
     maps = {name: None if value is None else value[images] for name, value in maps.items()}
-    cameras = frames.cameras.select(images) if image_cloud is None else frames.cameras.select(images, image_cloud)
-    return dataclasses.replace(frames, **maps, cameras=cameras)
+    return dataclasses.replace(frames, **maps, cameras=frames.cameras.select(images, image_cloud))
 
 
 def take_scenes(frames: Frames, scenes: Sequence[int]) -> Frames:
@@ -154,19 +154,20 @@ def take_scenes(frames: Frames, scenes: Sequence[int]) -> Frames:
 
 def take_scenes_of_particles(particles: Particles, scenes: Sequence[int]) -> Particles:
     """The particles of ``scenes``, in that order; one may be taken several times."""
-    table = particles.clouds
-    clouds = [(new, q) for new, scene in enumerate(scenes) for q in range(len(table)) if table.scenes[q] == scene]
-    runs = table.row_runs([q for _, q in clouds])
-    new = CloudTable.make(
-        (table.count(q) for _, q in clouds),
-        (scene for scene, _ in clouds),
-        (table.steps[q] for _, q in clouds),
-        particles.cu_rows.device,
+    own = particles.clouds.scenes
+    new_scene, clouds = zip(*((new, q) for new, scene in enumerate(scenes) for q in range(len(own)) if own[q] == scene))
+    return dataclasses.replace(
+        particles.select_clouds(clouds),
+        cloud_scene=torch.tensor(new_scene, device=particles.cloud_scene.device),
+        origin=particles.origin[list(scenes)],
+        world_offset=None if particles.world_offset is None else particles.world_offset[list(scenes)],
     )
-    fields = {name: take_runs(value, runs) for name, value in particles.row_fields().items()}
-    offset = None if particles.world_offset is None else particles.world_offset[list(scenes)]
-    fields |= {"origin": particles.origin[list(scenes)], "world_offset": offset}
-    return particles.with_clouds(new, **fields)
+
+
+def repack(particles: Particles, order: Tensor, counts: Iterable[int]) -> Particles:
+    """Particles number ``order`` (int64 [M]), ``counts`` of them in each cloud."""
+    table = CloudTable.make(counts, particles.clouds.scenes, particles.clouds.steps, order.device)
+    return particles.with_clouds(table, **{name: value[order] for name, value in particles.row_fields().items()})
 
 
 def reordered(particles: Particles, order: Tensor) -> Particles:
@@ -186,10 +187,9 @@ def random_order(particles: Particles, seed: int = 0) -> Tensor:
 
 def move_cameras(cameras: Cameras, rotation: Tensor, translation: Tensor) -> Cameras:
     """Cameras of a world moved by ``x -> rotation x + translation``, in float64."""
-    viewmats = cameras.viewmats.double()
-    motion = torch.eye(4, dtype=torch.float64, device=viewmats.device)
+    motion = torch.eye(4, dtype=torch.float64, device=rotation.device)
     motion[:3, :3], motion[:3, 3] = rotation.T, -rotation.T @ translation
-    return dataclasses.replace(cameras, viewmats=viewmats @ motion)
+    return dataclasses.replace(cameras, viewmats=cameras.viewmats.double() @ motion)
 
 
 def move_gaussians(gaussians: Gaussians, rotation: Tensor, translation: Tensor) -> Gaussians:
@@ -259,26 +259,18 @@ def _color(simulator: Simulator, particles: Particles, cameras: Cameras) -> Tens
     return simulator.render(particles, cameras).color.detach()
 
 
-def _scene_cameras(cameras: Cameras, scenes: Sequence[int]) -> Cameras:
-    """The cameras of ``scenes``, in that order, renumbered."""
-    owner = cameras.image_cloud.tolist()
-    images = [(i, new) for new, scene in enumerate(scenes) for i, own in enumerate(owner) if own == scene]
-    rows, clouds = zip(*images, strict=True)
-    return cameras.select(*(torch.tensor(x, device=cameras.near.device) for x in (rows, clouds)))
+def _in_float64(cameras: Cameras) -> Cameras:
+    return dataclasses.replace(cameras, viewmats=cameras.viewmats.double())
 
 
 @torch.no_grad()
 def repeat(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
     """The same input twice: equal bits."""
-    runs = []
-    for _ in range(2):
-        state = simulator.encode(sample.frames)
-        steps = _future(simulator, state, sample)
-        runs.append((state, steps, _color(simulator, steps[-1], sample.targets)))
-    (state, steps, image), (again, later, picture) = runs
+    state, again = (simulator.encode(sample.frames) for _ in range(2))
     yield from compare_particles("encode", again, state, 0)
-    for step, other in zip(steps, later, strict=True):
+    for step, other in zip(_future(simulator, state, sample), _future(simulator, again, sample), strict=True):
         yield from compare_particles("rollout", other, step, 0)
+    image, picture = (_color(simulator, particles, sample.targets) for particles in (step, other))
     yield compare_images("render", picture, image, 0)
 
 
@@ -287,10 +279,9 @@ def translate(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
     """Scene, cameras and origin moved by whole voxels: the same particles there, the same images."""
     shift = voxel_shift(simulator, sample.frames.origin)
     still = torch.eye(3, dtype=torch.float64, device=shift.device)
-    frames = dataclasses.replace(sample.frames, cameras=move_cameras(sample.frames.cameras, still, 0 * shift))
-    moved = dataclasses.replace(
-        frames, cameras=move_cameras(frames.cameras, still, shift), origin=frames.origin + shift
-    )
+    frames = dataclasses.replace(sample.frames, cameras=_in_float64(sample.frames.cameras))
+    cameras = move_cameras(frames.cameras, still, shift)
+    moved = dataclasses.replace(frames, cameras=cameras, origin=frames.origin + shift)
     expected = simulator.encode(frames)
     yield from compare_particles("encode", _moved(simulator.encode(moved), -shift), expected, BOUND)
     for state in _states(simulator, sample):
@@ -301,7 +292,7 @@ def translate(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
         unmoved = [name for name in step.row_fields() if name not in moved]
         yield from compare_particles("step", there, step, 0, unmoved)
         yield from compare_particles("step", _moved(there, -shift), step, BOUND, moved)
-        targets = move_cameras(sample.targets, still, 0 * shift)
+        targets = _in_float64(sample.targets)
         image = _color(simulator, step, targets)
         picture = _color(simulator, _moved(step, shift), move_cameras(targets, still, shift))
         yield compare_images("render", picture, image, IMAGE_BOUND)
@@ -311,21 +302,17 @@ def translate(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
 def rotate(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
     """Cameras rotated and moved together: depths stay; Gaussians and cameras moved together: images stay."""
     rotation, translation = random_motion(0, sample.frames.origin)
-    cameras = move_cameras(sample.frames.cameras, torch.eye(3).to(rotation), 0 * translation)
-    frames = dataclasses.replace(sample.frames, cameras=cameras)
-    moved = dataclasses.replace(frames, cameras=move_cameras(cameras, rotation, translation))
+    frames = dataclasses.replace(sample.frames, cameras=_in_float64(sample.frames.cameras))
+    moved = dataclasses.replace(frames, cameras=move_cameras(frames.cameras, rotation, translation))
     expected, there = simulator.encode(frames), simulator.encode(moved)
+    gaussians = simulator.renderer(last_steps(expected, 1))
     means = (expected.means.double() @ rotation.T + translation).to(expected.means)
-    yield from compare_particles(
-        "encode", there, dataclasses.replace(expected, means=means), BOUND, ["means", "opacities"]
-    )
-    newest = last_steps(expected, 1)
-    gaussians = simulator.renderer(newest)
-    targets = move_cameras(sample.targets, torch.eye(3).to(rotation), 0 * translation)
+    expected = dataclasses.replace(expected, means=means)
+    yield from compare_particles("encode", there, expected, BOUND, ["means", "opacities"])
+    targets = _in_float64(sample.targets)
     image = render(gaussians, targets).color
-    picture = render(
-        move_gaussians(gaussians, rotation, translation), move_cameras(targets, rotation, translation)
-    ).color
+    there = move_gaussians(gaussians, rotation, translation)
+    picture = render(there, move_cameras(targets, rotation, translation)).color
     yield compare_images("render", picture, image, IMAGE_BOUND)
 
 
@@ -384,8 +371,9 @@ def _together_and_apart(simulator: Simulator, sample: Sample, scenes: Sequence[i
         yield from compare_particles("rollout", other, take_scenes_of_particles(step, scenes), exact)
     image = _color(simulator, step, sample.targets)
     owner = sample.targets.image_cloud.tolist()
-    images = [i for scene in scenes for i, own in enumerate(owner) if own == scene]
-    picture = _color(simulator, other, _scene_cameras(sample.targets, scenes))
+    chosen = [(i, new) for new, scene in enumerate(scenes) for i, own in enumerate(owner) if own == scene]
+    images, clouds = torch.tensor(chosen, device=image.device).T
+    picture = _color(simulator, other, sample.targets.select(images, clouds))
     yield compare_images("render", picture, image[images], IMAGE_BOUND if exact == BOUND else exact)
 
 
@@ -420,10 +408,8 @@ def append_far_particle(simulator: Simulator, sample: Sample) -> Iterator[Deviat
         yield from compare_particles("the far particle's", _beyond(other, far), distant, 0)
     hidden = other.means[:, 0] > far / 2
     invisible = dataclasses.replace(other, opacities=other.opacities.masked_fill(hidden, 0))
-    image = _color(simulator, step, sample.targets)
-    yield compare_images(
-        "render", _color(simulator, invisible, sample.targets), image, IMAGE_BOUND if exact == BOUND else exact
-    )
+    image, picture = (_color(simulator, particles, sample.targets) for particles in (step, invisible))
+    yield compare_images("render", picture, image, IMAGE_BOUND if exact == BOUND else exact)
 
 
 def _beyond(particles: Particles, far: float, wanted: bool = True) -> Particles:
@@ -432,21 +418,20 @@ def _beyond(particles: Particles, far: float, wanted: bool = True) -> Particles:
 
 def _with_far_particle(state: Particles, far: float) -> Particles:
     """``state`` and at the end of each cloud that is not empty a copy of its first particle, ``far`` metres away."""
-    table, order, counts = state.clouds, [], []
-    for q in range(len(table)):
-        begin, count = table.starts[q], table.count(q)
-        order += [*range(begin, begin + count), *[begin] * min(1, count)]
-        counts.append(count + min(1, count))
-    order = torch.tensor(order, device=state.means.device)
-    fields = {name: value[order] for name, value in state.row_fields().items()}
-    new = CloudTable.make(counts, table.scenes, table.steps, state.cu_rows.device)
-    is_copy = torch.zeros(len(order), dtype=torch.bool, device=order.device)
-    is_copy[[new.starts[q + 1] - 1 for q in range(len(new)) if new.count(q)]] = True
-    fields["means"] = fields["means"] + far * is_copy[:, None]
-    fields["activity"] = fields["activity"].masked_fill(is_copy, DYNAMIC)
-    if state.velocity is not None:
-        fields["velocity"] = fields["velocity"] * ~is_copy[:, None]
-    return state.with_clouds(new, **fields)
+    order, is_copy, counts = [], [], []
+    for begin, end in pairwise(state.clouds.starts):
+        rows = [*range(begin, end), *range(begin, min(begin + 1, end))]
+        order += rows
+        is_copy += [number >= end - begin for number in range(len(rows))]
+        counts.append(len(rows))
+    grown = repack(state, torch.tensor(order, device=state.means.device), counts)
+    is_copy = torch.tensor(is_copy, device=state.means.device)
+    return dataclasses.replace(
+        grown,
+        means=grown.means + far * is_copy[:, None],
+        activity=grown.activity.masked_fill(is_copy, DYNAMIC),
+        velocity=None if grown.velocity is None else grown.velocity * ~is_copy[:, None],
+    )
 
 
 INVARIANCES: dict[str, Check] = {

@@ -6,11 +6,11 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,7 +24,7 @@ from gsim3d.compat.released_model import ReleasedSimulator
 from gsim3d.data import Scene, find_scenes, make_frames
 from gsim3d.data.check import check_scene
 from gsim3d.errors import InputError, did_you_mean
-from gsim3d.io.files import write_whole
+from gsim3d.io.files import whole_file, write_whole
 from gsim3d.io.terminal import progress
 from gsim3d.pretrained import known_failures, located, names
 from gsim3d.simulator import Simulator
@@ -136,9 +136,8 @@ def sample_of_scenes(subject: Subject, folders: Sequence[Path], full: bool = Fal
     for folder in folders:
         if len(scenes) == MAX_SCENES:
             break
-        found = check_scene(folder).problems
-        problems += found
-        if found:
+        if found := check_scene(folder).problems:
+            problems += found
             continue
         scene = subject.restored.open_scene(folder) if subject.restored else Scene.open(folder)
         if not scenes or (scene.width, scene.height) == (scenes[0].width, scenes[0].height):
@@ -158,11 +157,11 @@ def sample_of_scenes(subject: Subject, folders: Sequence[Path], full: bool = Fal
 
 
 def _views(subject: Subject, scene: Scene, count: int | None = None) -> list[int]:
+    cameras, usual = range(scene.n_cams), 3
     if subject.restored is not None:
         data = subject.restored.data_of(scene)
-        cameras = context_cameras(scene, data)
-        return list(spread_views(cameras, min(len(cameras), count or data.context_views), 0))
-    return list(spread_views(range(scene.n_cams), min(count or 3, scene.n_cams), 0))
+        cameras, usual = context_cameras(scene, data), data.context_views
+    return list(spread_views(cameras, min(len(cameras), count or usual), 0))
 
 
 def random_sample(subject: Subject) -> Sample:
@@ -234,14 +233,12 @@ def check(
         if released and name in INVARIANCES and name != "repeat":
             yield Finding(name, "not promised", reason="the model repeats the behaviour of the release"), tried
             continue
-        start, crash = time.perf_counter(), None
-        deviations: list[Deviation] = []
+        start, crash, deviations = time.perf_counter(), None, []
         try:
             deviations.extend(CHECKS[name](subject.simulator, tried))
         except Exception as error:  # is a finding; the other checks go on
-            crash = Deviation(
-                f"ends with {type(error).__name__}", float("inf"), 0.0, " ".join(str(error).split())[:300]
-            )
+            message = " ".join(str(error).split())[:300]
+            crash = Deviation(f"ends with {type(error).__name__}", math.inf, 0.0, message)
             deviations.append(crash)
         failures = tuple(deviation for deviation in deviations if not deviation.holds)
         worst = max(deviations, key=lambda d: d.error / d.bound if d.bound else d.error, default=None)
@@ -259,14 +256,12 @@ def save_sample(path: Path, sample: Sample, what: dict) -> None:
     Args:
         what: name of the check, and origin of the model.
     """
-    tensors = {f"frames.{k}": v for k, v in vars(sample.frames).items() if isinstance(v, Tensor)}
-    tensors |= {f"cameras.{k}": v for k, v in vars(sample.frames.cameras).items() if isinstance(v, Tensor)}
-    tensors |= {f"targets.{k}": v for k, v in vars(sample.targets).items() if isinstance(v, Tensor)}
+    parts = {"frames": sample.frames, "cameras": sample.frames.cameras, "targets": sample.targets}
+    tensors = {f"{part}.{k}": v for part, of in parts.items() for k, v in vars(of).items() if isinstance(v, Tensor)}
     size = {"width": sample.targets.width, "height": sample.targets.height, "n_steps": sample.n_steps}
-    part = path.with_name(f".{path.name}.part")
     text = {"gsim3d_stability": json.dumps({"format": FORMAT, **size, **what})}
-    save_file({k: v.detach().cpu().contiguous().clone() for k, v in tensors.items()}, part, text)
-    os.replace(part, path)
+    with whole_file(path) as part:
+        save_file({k: v.detach().cpu().contiguous().clone() for k, v in tensors.items()}, part, text)
 
 
 def load_sample(path: str | Path) -> tuple[Sample, dict]:
@@ -304,27 +299,21 @@ def write_report(report: Report, out: Path) -> None:
         if finding.failures:
             lines += ["", f"## {finding.check}", "", (CHECKS[finding.check].__doc__ or "").strip(), ""]
             lines += [f"- {deviation}" for deviation in finding.failures[:20]]
-            more = len(finding.failures) - 20
-            lines += [f"- and {more} more"] if more > 0 else []
+            lines += [f"- and {more} more"] if (more := len(finding.failures) - 20) > 0 else []
             lines += ["", f"Again: `gsim3d doctor --stability --replay {finding.file}`"]
     text = "\n".join(lines) + "\n"
-    for name, content in {"report.md": text, "report.json": json.dumps(_plain(report), indent=1) + "\n"}.items():
+    plain = _plain({"healthy": report.healthy, **dataclasses.asdict(report)})
+    for name, content in {"report.md": text, "report.json": json.dumps(plain, indent=1) + "\n"}.items():
         write_whole(out / name, content)
 
 
-def _plain(report: Report) -> dict:
-    """The report as plain values; an infinite error is a text."""
-
-    def plain(value):
-        if dataclasses.is_dataclass(value):
-            return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-        if isinstance(value, (tuple, list)):
-            return [plain(item) for item in value]
-        if isinstance(value, dict):
-            return {key: plain(item) for key, item in value.items()}
-        return str(value) if isinstance(value, float) and not value < float("inf") else value
-
-    return {"healthy": report.healthy, **plain(report)}
+def _plain(value: Any) -> Any:
+    """``value`` whose infinite numbers are texts, for JSON."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (tuple, list)):
+        return [_plain(item) for item in value]
+    return str(value) if isinstance(value, float) and not value < math.inf else value
 
 
 @dataclass(frozen=True)

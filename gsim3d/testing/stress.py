@@ -19,8 +19,16 @@ from gsim3d.effects.plan import Plan
 from gsim3d.errors import NumericalError
 from gsim3d.numerics.report import StabilityReport
 from gsim3d.simulator import Simulator
-from gsim3d.state import CloudTable, Particles, take_runs
-from gsim3d.testing.invariances import Check, Deviation, Sample, particle_name, select_images, take_scenes_of_particles
+from gsim3d.state import Particles
+from gsim3d.testing.invariances import (
+    Check,
+    Deviation,
+    Sample,
+    particle_name,
+    repack,
+    select_images,
+    take_scenes_of_particles,
+)
 
 MAX_MASS_DRIFT = 0.01  # relative change of the sum of opacities in a rollout of a model that does not predict them
 GRADIENT_STEPS = 12
@@ -109,7 +117,7 @@ def _finite(what: str, particles: Particles) -> Iterator[Deviation]:
     """Whether each attribute is finite; names the first particle that is not."""
     for name, value in particles.row_fields().items():
         if value.is_floating_point() and value.numel():
-            bad = ~value.detach().flatten(1).isfinite().all(1) if value.dim() > 1 else ~value.detach().isfinite()
+            bad = ~value.detach().reshape(len(value), -1).isfinite().all(1)
             row = int(bad.int().argmax())
             yield _holds(f"{what} {name} is finite", not bool(bad.any()), particle_name(particles, row))
 
@@ -190,45 +198,34 @@ def not_a_number(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
             others = range(scene)
             step, expected = (take_scenes_of_particles(p, others) for p in (step, expected))
             same = torch.equal(step.means, expected.means) or step.means.dtype == torch.float64
-            yield _holds(
-                "scenes beside a particle that is not finite are bit-equal",
-                same,
-                f"step {expected.cloud_step.tolist()}",
-            )
+            what = "scenes beside a particle that is not finite are bit-equal"
+            yield _holds(what, same, f"step {expected.cloud_step.tolist()}")
 
 
 def _refuses(what: str, call: Callable, names: str) -> Deviation:
     """Whether ``call`` raises a NumericalError that names the scene, image or camera."""
+    message = ""
     try:
         call()
     except NumericalError as error:
-        return _holds(f"{what}: a NumericalError names it", names in str(error), f"{names}; it says: {error}")
-    return _holds(f"{what}: a NumericalError names it", False, f"{names}; there was no error")
+        message = str(error)
+    where = f"{names}; it says: {message}" if message else f"{names}; there was no error"
+    return _holds(f"{what}: a NumericalError names it", names in message, where)
 
 
 @torch.no_grad()
 def crowds(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
     """One particle, all particles at one position, and every particle twice: finite rollouts and images."""
     state = simulator.encode(sample.frames).detach()
-    table, device = state.clouds, state.means.device
-    first = [(table.starts[q], table.starts[q] + min(1, table.count(q))) for q in range(len(table))]
-    counts = [end - begin for begin, end in first]
-    lonely = state.with_clouds(
-        CloudTable.make(counts, table.scenes, table.steps, device),
-        **{name: take_runs(value, first) for name, value in state.row_fields().items()},
-    )
-    start = torch.tensor(table.starts[:-1], device=device).clamp(max=max(0, state.n_rows - 1))
-    gathered = dataclasses.replace(state, means=state.means[start[state.row_cloud()]])
-    twice = torch.arange(state.n_rows, device=device).repeat_interleave(2)
-    doubled = state.with_clouds(
-        CloudTable.make((2 * table.count(q) for q in range(len(table))), table.scenes, table.steps, device),
-        **{name: value[twice] for name, value in state.row_fields().items()},
-    )
-    for name, crowd in {
-        "one particle": lonely,
-        "all at one position": gathered,
-        "every particle twice": doubled,
-    }.items():
+    counts = [state.clouds.count(q) for q in range(state.n_clouds)]
+    first = state.cu_rows[state.row_cloud()]  # of the cloud of each particle
+    number = torch.arange(state.n_rows, device=first.device)
+    crowds = {
+        "one particle": state.select_rows(number == first),
+        "all at one position": dataclasses.replace(state, means=state.means[first]),
+        "every particle twice": repack(state, number.repeat_interleave(2), [2 * count for count in counts]),
+    }
+    for name, crowd in crowds.items():
         steps = simulator.rollout(crowd, sample.n_steps, sample.plan, report=StabilityReport())
         yield from _finite(f"{name}: rollout's", steps[-1])
         yield _finite_image(f"{name}:", simulator, steps[-1], sample.targets)
@@ -246,11 +243,8 @@ def strange_cameras(simulator: Simulator, sample: Sample) -> Iterator[Deviation]
     away, far = targets.viewmats.clone(), targets.viewmats.clone()
     away[0, 1:3] = -away[0, 1:3]
     far[0, 2, 3] += 1e6
-    for name, viewmats in {
-        "inside of a particle": inside,
-        "looking away": away,
-        "a thousand kilometres off": far,
-    }.items():
+    strange = {"inside of a particle": inside, "looking away": away, "a thousand kilometres off": far}
+    for name, viewmats in strange.items():
         camera = dataclasses.replace(targets, viewmats=viewmats)
         yield _finite_image(f"a camera {name}:", simulator, newest, camera)
 
@@ -282,9 +276,8 @@ def gradients(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
     state, n = simulator.encode(sample.frames).detach(), min(sample.n_steps, GRADIENT_STEPS)
     norms, of_parameters = gradient_norms(simulator, state, sample.targets, n, sample.plan)
     for step, norm in enumerate(norms):
-        yield _holds(
-            "the gradient with respect to a state is finite", math.isfinite(norm), f"{n - step} steps before the image"
-        )
+        what, where = "the gradient with respect to a state is finite", f"{n - step} steps before the image"
+        yield _holds(what, math.isfinite(norm), where)
     for name, gradient in of_parameters.items():
         yield _holds("the gradient of a parameter is finite", bool(gradient.isfinite().all()), name)
 
