@@ -97,7 +97,7 @@ class Simulator(nn.Module):
             InputError: there is no such checkpoint, it is broken or one of the published model, ``device`` is not
                 there, or ``speed`` was not tuned; the message says what to do.
         """
-        return loading.load(cls, name_or_path, device, speed)
+        return loading.load((cls,), name_or_path, device, speed)[0]
 
     def save_pretrained(self, folder: str | Path) -> Path:
         """Writes weights and configuration, for :meth:`from_pretrained`.
@@ -115,29 +115,35 @@ class Simulator(nn.Module):
     @torch.no_grad()
     def predict(
         self,
-        source: Frames | FrameSource,
+        source: Frames | FrameSource | Particles,
         steps: int,
+        plan: Plan | None = None,
         *,
         cameras: Cameras | None = None,
         background: Tensor | None = None,
         edits: Sequence[Edit] = (),
+        wrap: Callable[[Callable], Callable] | None = None,
+        log: RestLog | None = None,
     ) -> Prediction:
         """The future of scenes: :meth:`encode`, :meth:`rollout` and :meth:`render` as the simulator's ``setting`` says.
 
         Args:
             source: input images, or anything that gives them: :class:`gsim3d.data.Scene`, or an own class with a method
-                ``input_frames(inputs)`` (:class:`gsim3d.cameras.FrameSource`).
+                ``input_frames(inputs)`` (:class:`gsim3d.cameras.FrameSource`), or particles that are encoded.
             steps: how many to predict, at least 1.
+            plan: what to compute; None: that of :meth:`plan`.
             cameras: of the images of each step; None: none are drawn.
             background: [3] or [I, 3], of the images; default black.
             edits: changes of the scene on the way.
+            wrap: as of :meth:`rollout`; not called where the setting replays a CUDA graph.
+            log: as of :meth:`rollout`.
         Returns:
             Particles of the steps after the last input step, and their images.
         Raises:
             InputError: ``steps`` is below 1, the images have another size than those of the training, or an edit cannot
                 be made.
         """
-        return predict(self, source, steps, cameras, background, edits)
+        return predict(self, source, steps, plan, cameras, background, edits, wrap=wrap, log=log)
 
     def encode(
         self,

@@ -57,8 +57,8 @@ def run(args: argparse.Namespace) -> int:
         return 0 if check_installation() else 1
     from pathlib import Path
 
+    from gsim3d.pretrained.loading import check_device
     from gsim3d.testing.stability import Job, check_stability, describe, replay
-    from gsim3d.train.restore import check_device
 
     check_device(args.device)
     if args.replay:

@@ -52,33 +52,30 @@ def run(args: argparse.Namespace) -> int:
     from gsim3d.effects.edits import load_edits, structure_of
     from gsim3d.effects.spec import EffectsSpec, OutputEffects
     from gsim3d.evaluate.pictures import write_prediction
-    from gsim3d.evaluate.protocol import check_cameras, default_views, encode_folder
+    from gsim3d.evaluate.protocol import check_cameras, default_views, encode_folder, predict
     from gsim3d.io.files import new_output_path
-    from gsim3d.numerics.speed import load_speed
-    from gsim3d.pretrained import located
-    from gsim3d.profile.settings import Runner
     from gsim3d.train.restore import restore
 
-    out, checkpoint = new_output_path(args.out), located(args.checkpoint)
-    restored = restore(args.checkpoint, args.device)
+    out = new_output_path(args.out)
+    restored = restore(args.checkpoint, args.device, args.speed)
     scene = restored.open_scene(args.scene, args.keep, args.resample)
     context, target = default_views(restored, scene, args.context)
     cams = args.cameras or list(target[:4])
     check_cameras(scene, (*cams, *context))
-    n_future = args.steps or max(1, scene.n_steps - args.start - restored.data.history)
-    spec = restored.plan.spec if args.effects is None else EffectsSpec.load(args.effects)
+    n_trained, simulator = restored.data.history, restored.simulator
+    n_future = args.steps or max(1, scene.n_steps - args.start - n_trained)
+    spec = restored.plan.spec
+    if args.effects is not None:
+        spec = simulator.setting.of_effects(EffectsSpec.load(args.effects), simulator.config.dynamics.is_asymmetric)
     edits = ()
     if args.edit is not None:
         edits = load_edits(args.edit, lambda folder: encode_folder(restored, folder, args.resample))
         spec = replace(spec, structure=structure_of(edits))
-    restored = replace(restored, plan=restored.simulator.plan(replace(spec, outputs=OutputEffects())))
-    folder = checkpoint if checkpoint.is_dir() else checkpoint.parent
-    runner = Runner(restored, load_speed(folder, restored.checkpoint.digest, args.device, args.speed))
+    restored = replace(restored, plan=simulator.plan(replace(spec, outputs=OutputEffects())))
+    first = args.start + n_trained - restored.n_encoded
     with progress(None, "simulating", n_future, unit="step", quiet=args.quiet) as bar:
-        prediction = runner.predict(scene, context, n_future, args.start, edits, bar.update)
-    drawn = replace(restored, simulator=runner.simulator, plan=runner.plan)
-    first = args.start + runner.skipped
-    write_prediction(out, drawn, scene, prediction, cams, first, player=args.html, quiet=args.quiet)
+        prediction = predict(restored, scene, context, n_future, first, edits, bar.update)
+    write_prediction(out, restored, scene, prediction, cams, first, player=args.html, quiet=args.quiet)
     rested = f" ({prediction.resting:.0%} of the particles at rest, not computed)" if prediction.resting else ""
     print(f"{prediction.n_encoded} steps encoded, {n_future} predicted{rested}; written: {out}")
     return 0

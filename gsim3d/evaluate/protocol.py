@@ -25,6 +25,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from gsim3d.cameras import Frames
 from gsim3d.data import Scene, make_frames
 from gsim3d.data.recording import BACKGROUND
 from gsim3d.dynamics import RestLog, concatenate
@@ -33,11 +34,11 @@ from gsim3d.errors import FitWarning, InputError, NumericalError
 from gsim3d.evaluate.predictions import Predictions
 from gsim3d.evaluate.scoring import EXACT_PARTS, PLAIN_METRICS, SceneScores, SceneTruth
 from gsim3d.io.terminal import progress
-from gsim3d.nn.layers import exact_convolutions
+from gsim3d.numerics.speed import draw, encode
 from gsim3d.state import DYNAMIC, Particles
 from gsim3d.train.processes import Processes
 from gsim3d.train.restore import Restored
-from gsim3d.train.samples import context_cameras, spread_views, subsampled
+from gsim3d.train.samples import context_cameras, spread_views
 
 METHODS = ("model", "constant", "copy", "constant_velocity", "release_constant", *EXACT_PARTS)
 TOGETHER = 8  # scenes that a GPU predicts in one rollout, fewer where they are large
@@ -126,6 +127,7 @@ def predict(
     n_future: int,
     start: int = 0,
     edits: Sequence[Edit] = (),
+    on_steps: Callable[[int], object] | None = None,
 ) -> Prediction:
     """Encodes ``history`` steps of a scene from ``start`` and rolls out ``n_future`` steps, also beyond its last frame.
 
@@ -136,11 +138,13 @@ def predict(
         n_future: steps to predict.
         start: first given step.
         edits: changes of the scene on the way.
+        on_steps: is called with the number of steps that have just been simulated.
     Raises:
         InputError: images of another size than in training, cameras and steps that the scene has not, or an edit that
             cannot be made.
     """
-    return predict_together(restored, [scene], n_future, [context_cams], start=start, edits=edits)[0]
+    options = {"start": start, "edits": edits, "on_steps": on_steps}
+    return predict_together(restored, [scene], n_future, [context_cams], **options)[0]
 
 
 def check_cameras(scene: Scene, cams: Sequence[int]) -> None:
@@ -155,7 +159,6 @@ def encode_folder(restored: Restored, folder: str | Path, resample: bool = False
     return encode_steps(restored, scene, default_views(restored, scene)[0])
 
 
-@torch.no_grad()
 def predict_together(
     restored: Restored,
     scenes: Sequence[Scene],
@@ -164,6 +167,7 @@ def predict_together(
     *,
     start: int = 0,
     edits: Sequence[Edit] = (),
+    on_steps: Callable[[int], object] | None = None,
 ) -> list[Prediction]:
     """:func:`predict` of several scenes in one rollout.
 
@@ -174,13 +178,23 @@ def predict_together(
         contexts: input cameras of each scene; default: those of :func:`default_views`.
         start: first given step.
         edits: changes of the scenes on the way.
+        on_steps: is called with the number of steps that have just been simulated.
     """
     _check_count(n_future)
+
+    def counted(predict: Callable) -> Callable:
+        def wrapped(*state, **options):
+            steps = predict(*state, **options)
+            on_steps(steps.n_clouds)
+            return steps
+
+        return wrapped
+
     contexts = [default_views(restored, scene)[0] for scene in scenes] if contexts is None else contexts
     encoded, log = _encode(restored, scenes, contexts, start), RestLog()
-    with exact_convolutions():
-        steps = restored.simulator.rollout(encoded, n_future, restored.plan, edits=edits, log=log)
-    together, n_encoded = concatenate([encoded, *steps]), restored.data.history
+    options = {"edits": edits, "log": log, "wrap": on_steps and counted}
+    steps = restored.simulator.predict(encoded, n_future, restored.plan, **options).steps
+    together, n_encoded = concatenate([encoded, *steps]), restored.n_encoded
     n_steps = n_encoded + n_future
     return [
         Prediction(
@@ -202,17 +216,25 @@ def encode_steps(restored: Restored, scene: Scene, context_cams: Sequence[int], 
 def _encode(
     restored: Restored, scenes: Sequence[Scene], contexts: Sequence[Sequence[int]], start: int = 0
 ) -> Particles:
-    n_encoded = restored.data.history
+    return encode(restored.simulator, input_frames(restored, scenes, contexts, start))
+
+
+def input_frames(
+    restored: Restored, scenes: Sequence[Scene], contexts: Sequence[Sequence[int]], start: int = 0
+) -> Frames:
+    """Images of ``history`` steps of scenes from ``start``, by as many of the cameras ``contexts`` as the simulator's
+    setting says. Errors as in :func:`predict`."""
+    n_encoded, most = restored.n_encoded, restored.simulator.setting.context_views
     for scene in scenes:
         restored.check_scene(scene)
         if not 0 <= start <= scene.n_steps - n_encoded:
             raise InputError(
                 f"{scene.path}: {n_encoded} steps from step {start} on do not fit its {scene.n_steps} steps"
             )
+    if most is not None:
+        contexts = [[cams[k * len(cams) // most] for k in range(min(most, len(cams)))] for cams in contexts]
     masked, steps = all(scene.has_segmentation() for scene in scenes), range(start, start + n_encoded)
-    frames = make_frames(scenes, [list(context) for context in contexts], [steps] * len(scenes), masked=masked)
-    with exact_convolutions():
-        return restored.simulator.encode(subsampled(frames, restored.data).to(restored.device))
+    return make_frames(scenes, [list(cams) for cams in contexts], [steps] * len(scenes), masked=masked)
 
 
 @torch.no_grad()
@@ -223,7 +245,7 @@ def render_steps(restored: Restored, particles: Particles, scene: Scene, cams: S
     """
     n_steps, n_views = particles.n_clouds, len(cams)
     cameras = scene.cameras_at(cams, range(start, start + n_steps)).to(particles.means.device)
-    images = restored.simulator.render(particles, cameras, plan=restored.plan).color
+    images = draw(restored.simulator, particles, cameras, None, restored.plan).color.float()
     return images.clamp(0, 1).unflatten(0, (n_steps, n_views))
 
 
@@ -278,7 +300,7 @@ def score_scene(
     """
     if restored is not None:
         context_cams, target_cams = default_views(restored, scene, context_cams, target_cams)
-        n_encoded = restored.data.history
+        n_encoded = restored.n_encoded
     n_given = start + n_encoded
     n_future = horizon(scene, n_given, n_future)
     cams, steps = list(target_cams), range(start, n_given + n_future)

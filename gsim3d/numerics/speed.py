@@ -14,12 +14,13 @@ import torch
 from gsim3d.cameras import Cameras, Frames, FrameSource, InputSpec
 from gsim3d.cuda_graphs import CapturedRollout, Prediction
 from gsim3d.effects.edits import Edit
+from gsim3d.effects.plan import Plan
 from gsim3d.effects.spec import EffectsSpec, Sleep
 from gsim3d.errors import InputError, check_ranges, did_you_mean
 from gsim3d.io.files import MAX_TEXT, read_file, shown
 from gsim3d.io.plain import parse_json
 from gsim3d.io.settings import from_dict
-from gsim3d.ops.raster import CUTOFFS
+from gsim3d.ops.raster import CUTOFFS, Rendering
 from gsim3d.presets import ModelConfig
 from gsim3d.state import DYNAMIC, Particles
 
@@ -159,40 +160,55 @@ class Setting:
         return particles.select_rows(kept)
 
 
-def predict(
-    simulator: Any,
-    source: Frames | FrameSource,
-    steps: int,
-    cameras: Cameras | None,
-    background: torch.Tensor | None,
-    edits: Sequence[Edit],
-) -> Prediction:
-    """:meth:`gsim3d.Simulator.predict`, as the setting of the simulator says."""
-    if steps < 1:
-        raise InputError(f"predict: steps must be at least 1; got {steps}")
+def encode(simulator: Any, source: Frames | FrameSource) -> Particles:
+    """The particles from which :func:`predict` simulates. Raises InputError for images of another size."""
     inputs = InputSpec() if simulator.inputs is None else simulator.inputs
     frames = source if isinstance(source, Frames) else source.input_frames(inputs)
     size = (frames.cameras.width, frames.cameras.height)
     if inputs.image_size and size != tuple(inputs.image_size):
         wanted = "x".join(map(str, inputs.image_size))
         raise InputError(f"predict: images must be of {wanted} pixels, as in training; got {size[0]}x{size[1]}")
-    setting, plan, device = simulator.setting, simulator.plan(), next(simulator.parameters()).device
+    setting, device = simulator.setting, next(simulator.parameters()).device
     frames = frames.subsample(inputs.background_stride, inputs.body_stride).to(device)
     with setting.precision("encoder", device.type):
-        state = setting.retained(simulator.encode(frames))
+        return setting.retained(simulator.encode(frames))
+
+
+def predict(
+    simulator: Any,
+    source: Frames | FrameSource | Particles,
+    steps: int,
+    plan: Plan | None,
+    cameras: Cameras | None,
+    background: torch.Tensor | None,
+    edits: Sequence[Edit],
+    **options: Any,
+) -> Prediction:
+    """:meth:`gsim3d.Simulator.predict`, as the setting of the simulator says; ``options`` are those of the rollout."""
+    if steps < 1:
+        raise InputError(f"predict: steps must be at least 1; got {steps}")
+    state, plan = source if isinstance(source, Particles) else encode(simulator, source), plan or simulator.plan()
+    setting, device = simulator.setting, state.means.device
     with setting.precision("dynamics", device.type):
         if setting.captured and not edits and device.type == "cuda":
             states = CapturedRollout(simulator, state, steps, plan)(state).steps
         else:
-            states = simulator.rollout(state, steps, plan, edits=edits)
-    if cameras is None:
-        return Prediction(states, [])
-    drawn, cameras = states, cameras.to(device)
-    if setting.least_opacity:
-        drawn = [step.select_rows(step.opacities >= setting.least_opacity) for step in states]
-    with setting.precision("renderer", device.type):
-        images = [simulator._draw(step, cameras, background, plan, cutoff=setting.cutoff) for step in drawn]
+            states = simulator.rollout(state, steps, plan, edits=edits, **options)
+    images = []
+    if cameras is not None:
+        images = [draw(simulator, step, cameras.to(device), background, plan) for step in states]
     return Prediction(states, images)
+
+
+def draw(
+    simulator: Any, particles: Particles, cameras: Cameras, background: torch.Tensor | None, plan: Plan
+) -> Rendering:
+    """Images of particles that ``simulator`` predicted, as its setting says."""
+    setting = simulator.setting
+    if setting.least_opacity:
+        particles = particles.select_rows(particles.opacities >= setting.least_opacity)
+    with setting.precision("renderer", particles.means.device.type):
+        return simulator._draw(particles, cameras, background, plan, cutoff=setting.cutoff)
 
 
 def read_speeds(folder: Path) -> dict[str, Any]:

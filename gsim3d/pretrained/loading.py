@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,7 +24,7 @@ from gsim3d.errors import InputError
 from gsim3d.io import checkpoint
 from gsim3d.io.files import shown
 from gsim3d.io.settings import from_dict, to_dict
-from gsim3d.numerics.speed import Setting, load_speed
+from gsim3d.numerics.speed import load_speed
 from gsim3d.ops import cuda_compiled
 from gsim3d.presets import ModelConfig
 
@@ -52,32 +52,27 @@ class Description:
         return {"model": to_dict(self.model), "data": data, "effects": effects}
 
 
-def load(cls: type[Model], name_or_path: str | Path, device: str, speed: str) -> Model:
-    """:meth:`gsim3d.Simulator.from_pretrained` of the simulator class ``cls``."""
+def load(
+    kinds: Sequence[type[Model]], name_or_path: str | Path, device: str, speed: str
+) -> tuple[Model, checkpoint.Checkpoint]:
+    """The simulator of a checkpoint, as :meth:`gsim3d.Simulator.from_pretrained`, and what the checkpoint holds.
+
+    Args:
+        kinds: simulator classes that may be loaded.
+    Raises:
+        InputError: as there; the message starts with ``name_or_path``.
+    """
     check_device(device)
     saved = checkpoint.load(name_or_path)
-    if is_released(saved.config) != (cls.config_class is not ModelConfig):
-        wanted = "gsim3d.compat.load_released" if cls.config_class is ModelConfig else "Simulator.from_pretrained"
+    released = is_released(saved.config)
+    cls = next((kind for kind in kinds if released == (kind.config_class is not ModelConfig)), None)
+    if cls is None:
+        wanted = "gsim3d.compat.load_released" if released else "Simulator.from_pretrained"
         raise InputError(f"{name_or_path}: a checkpoint of another kind of model; load it with {wanted}")
     folder = pretrained.located(name_or_path)
+    folder = folder if folder.is_dir() else folder.parent
     try:
-        folder = folder if folder.is_dir() else folder.parent
         setting = load_speed(folder, saved.digest, torch.device(device).type, speed)
-    except InputError as error:
-        raise InputError(f"{name_or_path}: {error}") from None
-    return of_checkpoint(cls, saved, name_or_path, setting).to(device)
-
-
-def of_checkpoint(
-    cls: type[Model], saved: checkpoint.Checkpoint, name_or_path: str | Path, setting: Setting = Setting()
-) -> Model:
-    """The simulator of class ``cls`` that ``saved`` holds, in evaluation mode on the CPU, run as ``setting`` says.
-
-    Raises:
-        InputError: the configuration describes no model, or the weights do not fit it; the message starts with
-            ``name_or_path``.
-    """
-    try:
         found = describe(saved.config, cls.config_class, pretrained.frame_rate(name_or_path))
         simulator = with_weights(cls, setting.of_model(found.model), found.effects, saved.weights)
     except InputError as error:
@@ -89,7 +84,7 @@ def of_checkpoint(
     asymmetric = simulator.config.dynamics.is_asymmetric
     simulator.effects, simulator.setting = setting.of_effects(found.effects, asymmetric), setting
     simulator.inputs = setting.of_inputs(found.inputs)
-    return simulator.eval()
+    return simulator.eval().to(device), saved
 
 
 def save(simulator: nn.Module, folder: Path) -> Path:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -11,12 +12,10 @@ from torch import Tensor
 
 from gsim3d.cameras import Cameras, Frames
 from gsim3d.cuda_graphs import CapturedRollout
-from gsim3d.data import Scene, make_frames
-from gsim3d.dynamics import RestLog, concatenate
-from gsim3d.effects.edits import Edit
-from gsim3d.errors import InputError
-from gsim3d.evaluate.protocol import Prediction
-from gsim3d.numerics.speed import PARTS, PRECISIONS, Setting
+from gsim3d.data import Scene
+from gsim3d.dynamics import RestLog
+from gsim3d.evaluate.protocol import input_frames
+from gsim3d.numerics.speed import PARTS, PRECISIONS, Setting, draw
 from gsim3d.simulator import Simulator
 from gsim3d.state import Particles
 from gsim3d.train.restore import Restored
@@ -48,29 +47,19 @@ class Runner:
         InputError: the model cannot do what the setting asks for.
 
     Attributes:
-        simulator, plan: what runs.
-        n_encoded: input steps.
+        restored, simulator, plan: what runs.
     """
 
     def __init__(self, restored: Restored, setting: Setting = Setting()):
-        self.restored, self.setting, self.device = restored, setting, restored.device
-        self.simulator = _changed(restored.simulator, setting)
+        self.simulator, self.setting, self.device = _changed(restored.simulator, setting), setting, restored.device
         asymmetric = self.simulator.config.dynamics.is_asymmetric
         self.plan = self.simulator.plan(setting.of_effects(restored.plan.spec, asymmetric))
-        self.n_encoded = min(setting.history or restored.data.history, restored.data.history)
+        self.restored = replace(restored, simulator=self.simulator, plan=self.plan)
 
-    @property
-    def skipped(self) -> int:
-        """First input steps that a history shorter than the training's leaves out."""
-        return self.restored.data.history - self.n_encoded
-
-    def frames(self, scenes: Sequence[Scene], context: Sequence[Sequence[int]], start: int = 0) -> Frames:
-        """Input images of cameras ``context``: of the training's history from step ``start`` on, the last steps."""
-        steps = [range(start + self.skipped, start + self.restored.data.history)] * len(scenes)
-        if self.setting.context_views is not None:
-            context = [_spread(cams, self.setting.context_views) for cams in context]
-        masked = all(scene.has_segmentation() for scene in scenes)
-        frames = make_frames(scenes, [list(cams) for cams in context], steps, masked=masked)
+    def frames(self, scenes: Sequence[Scene], context: Sequence[Sequence[int]]) -> Frames:
+        """Input images of cameras ``context``: of the first steps, the last ones where fewer are encoded than in
+        training."""
+        frames = input_frames(self.restored, scenes, context, self.restored.data.history - self.restored.n_encoded)
         return subsampled(frames, self.restored.data).to(self.device)
 
     def encode(self, frames: Frames) -> Particles:
@@ -105,47 +94,7 @@ class Runner:
     @torch.no_grad()
     def images(self, particles: Particles, cameras: Cameras) -> Tensor:
         """[I, H, W, 3] in [0, 1] of the particles of a step."""
-        if self.setting.least_opacity:
-            particles = particles.select_rows(particles.opacities >= self.setting.least_opacity)
-        with self.setting.precision("renderer", self.device.type):
-            rendering = self.simulator._draw(particles, cameras, plan=self.plan, cutoff=self.setting.cutoff)
-        return rendering.color.float().clamp(0, 1)
-
-    @torch.no_grad()
-    def predict(
-        self,
-        scene: Scene,
-        context: Sequence[int],
-        n_future: int,
-        start: int = 0,
-        edits: Sequence[Edit] = (),
-        on_steps: Callable[[int], object] | None = None,
-    ) -> Prediction:
-        """As :func:`gsim3d.evaluate.protocol.predict`, of the steps from ``start + skipped`` on, errors included.
-        ``on_steps`` is called with the number of steps that have just been simulated."""
-        self.restored.check_scene(scene)
-        if not 0 <= start <= scene.n_steps - self.restored.data.history:
-            raise InputError(f"{scene.path}: the input steps from step {start} on do not fit its {scene.n_steps} steps")
-        if n_future < 1:
-            raise InputError(f"the number of steps to predict must be at least 1; got {n_future}")
-
-        def counted(predict: Callable) -> Callable:
-            def wrapped(*state, **options):
-                steps = predict(*state, **options)
-                on_steps(steps.n_clouds)
-                return steps
-
-            return wrapped
-
-        encoded = self.encode(self.frames([scene], [context], start))
-        log = RestLog()
-        with self.setting.precision("dynamics", self.device.type):
-            if self.setting.captured and not edits:
-                steps = CapturedRollout(self.simulator, encoded, n_future, self.plan)(encoded).steps
-            else:
-                wrap = None if on_steps is None else counted
-                steps = self.simulator.rollout(encoded, n_future, self.plan, edits=edits, log=log, wrap=wrap)
-        return Prediction(concatenate([encoded, *steps]), self.n_encoded, tuple(context), log.resting_share)
+        return draw(self.simulator, particles, cameras, None, self.plan).color.float().clamp(0, 1)
 
     @property
     def draws_in_graph(self) -> bool:
@@ -165,20 +114,18 @@ class Runner:
             )
 
 
-def _spread(cams: Sequence[int], count: int) -> list[int]:
-    return [cams[k * len(cams) // count] for k in range(min(count, len(cams)))]
-
-
 def _changed(simulator: Simulator, setting: Setting) -> Simulator:
-    """``simulator``, or one with its weights in another geometry."""
+    """A simulator of the same weights, run as ``setting`` says."""
     config = setting.of_model(simulator.config)
     if config == simulator.config:
-        return simulator
-    device = next(simulator.parameters()).device
-    other = type(simulator)(config)
-    other.load_state_dict(simulator.state_dict())
-    other.absent, other.effects, other.inputs = simulator.absent, simulator.effects, simulator.inputs
-    return other.to(device).train(simulator.training)
+        other = copy.copy(simulator)
+    else:
+        other = type(simulator)(config)
+        other.load_state_dict(simulator.state_dict())
+        other.absent, other.effects = simulator.absent, simulator.effects
+        other = other.to(next(simulator.parameters()).device).train(simulator.training)
+    other.setting, other.inputs = setting, setting.of_inputs(simulator.inputs)
+    return other
 
 
 # ---- which settings there are ----

@@ -24,6 +24,7 @@ from gsim3d.evaluate.perceptual.lpips import LPIPS
 from gsim3d.evaluate.perceptual.weights import load
 from gsim3d.io import checkpoint
 from gsim3d.io.locks import only_one_writer
+from gsim3d.pretrained.loading import check_device
 from gsim3d.train.captured import CapturedLoss, Prepared
 from gsim3d.train.config import PhaseConfig, TrainConfig, check_same_run, check_settings
 from gsim3d.train.gradients import (
@@ -41,7 +42,7 @@ from gsim3d.train.log import Log, check_profile, memory_gib, plain, profiler, pr
 from gsim3d.train.losses import time_weights, training_loss
 from gsim3d.train.optimizer import FIRST_SCALE, LossScale, Optimizer, deterministic, one_cycle, update_average
 from gsim3d.train.processes import Processes
-from gsim3d.train.restore import build_simulator, check_device, describe, keep_jacobian, model_config
+from gsim3d.train.restore import build_simulator, describe, keep_jacobian, model_config
 from gsim3d.train.samples import Batch, BatchReader, check_scenes, draw_batch, history_at, unfreeze
 from gsim3d.train.stopping import noted_signals
 

@@ -19,12 +19,11 @@ from gsim3d.data.fitting import frame_stride
 from gsim3d.effects.plan import Plan
 from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import FitWarning, InputError, did_you_mean
-from gsim3d.io import checkpoint
+from gsim3d.io.checkpoint import Checkpoint
 from gsim3d.io.files import shown
 from gsim3d.io.settings import from_dict, to_dict, upgraded
 from gsim3d.presets import ModelConfig
 from gsim3d.pretrained import KEEP, loading
-from gsim3d.pretrained.loading import check_device
 from gsim3d.simulator import Simulator
 from gsim3d.train.config import DataConfig, TrainConfig
 
@@ -39,18 +38,29 @@ class Restored:
     Attributes:
         simulator: ready to predict.
         data: which frames and views it saw.
-        image_size: (width, height) pixels.
-        plan: of the effects it was trained with.
+        plan: what it computes: the effects it was trained with.
         checkpoint: where it came from.
-        fps: frames per second of the scenes it was trained on; None: the checkpoint does not say.
     """
 
     simulator: Simulator
     data: DataConfig
-    image_size: tuple[int, int]
     plan: Plan
-    checkpoint: checkpoint.Checkpoint
-    fps: float | None = None
+    checkpoint: Checkpoint
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(width, height) pixels of the training."""
+        return tuple(self.simulator.inputs.image_size)
+
+    @property
+    def fps(self) -> float | None:
+        """Frames per second of the scenes it was trained on; None: the checkpoint does not say."""
+        return self.simulator.inputs.fps
+
+    @property
+    def n_encoded(self) -> int:
+        """Input steps: those of the training, or fewer where the simulator's setting says so."""
+        return self.simulator.inputs.history
 
     @property
     def device(self) -> torch.device:
@@ -189,17 +199,13 @@ def describe(config: TrainConfig, model: ModelConfig, scene: Scene, effects: Eff
     }
 
 
-def restore(path: str | Path, device: str = "cpu") -> Restored:
-    """The simulator of a checkpoint (run folder, checkpoint folder or single file), ready to predict on ``device``.
+def restore(path: str | Path, device: str = "cpu", speed: str = "exact") -> Restored:
+    """:meth:`gsim3d.Simulator.from_pretrained`, also of the published model, with what it was trained for.
 
     Raises:
-        InputError: the checkpoint is broken or does not fit this version, or ``device`` is "cuda" where gsim3d was
-            built without CUDA or torch finds no GPU; the message says which.
+        InputError: as there, or the training's data settings are not of this version.
     """
-    check_device(device)
-    saved = checkpoint.load(path)
-    cls = ReleasedSimulator if loading.is_released(saved.config) else Simulator
-    simulator = loading.of_checkpoint(cls, saved, path)
+    simulator, saved = loading.load((Simulator, ReleasedSimulator), path, device, speed)
     data = {key: value for key, value in saved.config["data"].items() if key not in ("image_size", "fps")}
     if isinstance(data.get("near_far"), str):  # "of each scene", as version 0.1 wrote
         data.pop("near_far")
@@ -207,5 +213,4 @@ def restore(path: str | Path, device: str = "cpu") -> Restored:
         settings = from_dict(DataConfig, upgraded(DataConfig, data), "data")
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    inputs = simulator.inputs
-    return Restored(simulator.to(device), settings, tuple(inputs.image_size), simulator.plan(), saved, inputs.fps)
+    return Restored(simulator, settings, simulator.plan(), saved)

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from gsim3d import presets
+from gsim3d.cameras import InputSpec
 from gsim3d.cli.main import main
 from gsim3d.compat.released_model import ReleasedModelConfig
 from gsim3d.data import Scene
@@ -32,7 +33,8 @@ def restored():
     simulator = build_simulator(presets.tiny(), seed=0).eval()
     data = DataConfig(history=2, target_only_cameras=(2, 7), background_stride=2, body_stride=2, resize=(32, 32))
     data = dataclasses.replace(data, near_far=(1.2, 4.0))
-    return Restored(simulator, data, (32, 32), simulator.plan(EffectsSpec()), Checkpoint({}, {}), fps=12.0)
+    simulator.inputs = InputSpec(background_stride=2, body_stride=2, image_size=(32, 32), fps=12.0)
+    return Restored(simulator, data, simulator.plan(EffectsSpec()), Checkpoint({}, {}))
 
 
 def rig(folder, n_cams, size=32, **keys):
@@ -169,7 +171,8 @@ def test_missing_depths_are_guessed_and_kept(restored, tmp_path):
 
 
 def test_published_models_keep_their_depths(restored, tmp_path):
-    published = dataclasses.replace(restored, simulator=SimpleNamespace(config=ReleasedModelConfig()))
+    released = SimpleNamespace(config=ReleasedModelConfig(), inputs=restored.simulator.inputs)
+    published = dataclasses.replace(restored, simulator=released)
     scene, said = opened(published, rig(tmp_path / "scene", 5, near=0.5, far=9.0))
     assert (scene.near, scene.far) == (1.2, 4.0) and "depths 0.5 to 9 replaced by 1.2 to 4" in said
 

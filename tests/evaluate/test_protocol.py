@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from gsim3d import presets
+from gsim3d.cameras import InputSpec
 from gsim3d.data import Scene
 from gsim3d.dynamics import concatenate
 from gsim3d.effects.spec import EffectsSpec
@@ -29,6 +30,7 @@ from gsim3d.evaluate.protocol import (
 from gsim3d.evaluate.report import summarize, table, write_json
 from gsim3d.evaluate.scoring import SceneScores
 from gsim3d.io.checkpoint import Checkpoint
+from gsim3d.numerics.speed import Setting
 from gsim3d.train.config import DataConfig
 from gsim3d.train.restore import Restored, build_simulator
 from tests.tiny_scenes import write_scene
@@ -48,7 +50,8 @@ def restored():
     with torch.no_grad():
         simulator.dynamics.net.head.fc2.weight.normal_(0, 0.02, generator=torch.Generator().manual_seed(0))
     data = DataConfig(history=2, context_views=2, target_only_cameras=(3,), background_stride=2)
-    return Restored(simulator, data, (32, 32), simulator.plan(EffectsSpec()), Checkpoint({}, {}))
+    simulator.inputs = InputSpec(history=2, context_views=2, background_stride=2, image_size=(32, 32))
+    return Restored(simulator, data, simulator.plan(EffectsSpec()), Checkpoint({}, {}))
 
 
 def moved_to(device, restored):
@@ -248,8 +251,10 @@ def test_scores_are_the_same_on_both_devices(restored, scene, devices):
 
 
 def test_what_does_not_fit_is_named(restored, scene):
+    larger = copy.copy(restored.simulator)
+    larger.inputs = dataclasses.replace(larger.inputs, image_size=(64, 64))
     with pytest.raises(InputError, match="the model was trained on 64x64"):
-        predict(dataclasses.replace(restored, image_size=(64, 64)), scene, (0, 2), 1)
+        predict(dataclasses.replace(restored, simulator=larger), scene, (0, 2), 1)
     near_only = dataclasses.replace(restored.data, near_far=(scene.near, scene.far - 0.5))
     with pytest.raises(InputError, match="open the scene with open_scene"):
         predict(dataclasses.replace(restored, data=near_only), scene, (0, 2), 1)
@@ -300,3 +305,22 @@ def test_pictures(restored, scene, device):
     assert (frames[0][:256, :256] == truth[0, 0].repeat(8, 0).repeat(8, 1)).all()
     assert (frames[0][260:, 260:] == images[0, 1].repeat(8, 0).repeat(8, 1)).all()
     assert splat_picture(restored, prediction, scene, 3, 1).shape == (320, 320, 3)
+
+
+def test_predict_and_render_steps_follow_the_setting(restored, scene):
+    """As Simulator.predict does; the reference stays as it is."""
+    whole, fast = predict(restored, scene, (0, 2), 2), copy.copy(restored.simulator)
+    least = float(whole.step(2).opacities.quantile(0.8))
+    fast.setting = Setting(history=1, context_views=1, kept=0.5, least_opacity=least)
+    fast.inputs = fast.setting.of_inputs(fast.inputs)
+    fast = dataclasses.replace(restored, simulator=fast)
+    prediction = predict(fast, scene, (0, 2), 2, start=1)
+    assert prediction.n_encoded == 1 and prediction.n_steps == 3
+    frames = scene.input_frames(fast.simulator.inputs, start=1, cams=[0])
+    cameras = scene.cameras_at([3], [0])
+    expected = fast.simulator.predict(frames, 2, fast.plan, cameras=cameras)
+    assert torch.equal(prediction.step(2).means, expected.steps[1].means)
+    images = render_steps(fast, prediction.step(2), scene, [3])[0]
+    assert torch.equal(images, expected.renderings[1].color.clamp(0, 1))
+    assert prediction.step(2).n_rows < whole.step(2).n_rows / 2
+    assert not torch.equal(images, render_steps(restored, prediction.step(2), scene, [3])[0])

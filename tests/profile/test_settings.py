@@ -113,6 +113,7 @@ def test_model_of_two_steps_a_call(case):
     config = case.restored.simulator.config
     config = dataclasses.replace(config, dynamics=dataclasses.replace(config.dynamics, steps_per_call=2))
     simulator = type(case.restored.simulator)(config).eval()
+    simulator.inputs = case.restored.simulator.inputs
     two = BenchmarkCase(dataclasses.replace(case.restored, simulator=simulator), case.scenes, 3)
     runner = two.runner()
     assert len(runner.steps(two.start(runner, [0]), 3)) == 3 and runner.span(3) == 2
