@@ -36,6 +36,7 @@ from gsim3d.ops.raster import Rendering
 from gsim3d.state import DYNAMIC, CloudTable, Particles, keeping_constants, newest_clouds
 
 FACTOR = 1.25  # capacity over what was observed
+ROUNDED_PARTS = "dynamics", "renderer"  # of a simulator: what a rollout reads
 # In messages of errors for lack of memory: torch's, and those of ops, which say no more.
 OUT_OF_MEMORY = "out of memory", "DefaultCPUAllocator", "STATUS_ALLOC_FAILED", "aten::new_empty"
 
@@ -57,10 +58,7 @@ class Captured:
     """
 
     def __init__(
-        self,
-        function: Callable[[], Any],
-        device: torch.device | str = "cuda",
-        pool: tuple[int, int] | None = None,
+        self, function: Callable[[], Any], device: torch.device | str = "cuda", pool: tuple[int, int] | None = None
     ):
         self._device, self._constants = torch.device(device), {}
         if self._device.type != "cuda":
@@ -72,9 +70,8 @@ class Captured:
             with torch.cuda.device(self._device), keeping_constants(self._constants):
                 self._capture(function, pool)
         except (RuntimeError, MemoryError) as error:
-            raise CaptureError(
-                f"Captured: {str(error).splitlines()[0]}", out_of_memory=is_out_of_memory(error)
-            ) from error
+            message = f"Captured: {str(error).splitlines()[0]}"
+            raise CaptureError(message, out_of_memory=is_out_of_memory(error)) from error
         finally:
             torch.set_autocast_cache_enabled(cached)
 
@@ -98,16 +95,10 @@ class Captured:
 
 def is_out_of_memory(error: BaseException) -> bool:
     """Whether it was raised because memory was lacking."""
-    return any(
-        isinstance(cause, MemoryError) or any(text in str(cause) for text in OUT_OF_MEMORY) for cause in _causes(error)
-    )
-
-
-def _causes(error: BaseException | None) -> Iterator[BaseException]:
-    """``error`` and what it was raised because of: a capture that is broken off complains of that, too."""
-    while error is not None:
-        yield error
-        error = error.__cause__ or error.__context__
+    if isinstance(error, MemoryError) or any(text in str(error) for text in OUT_OF_MEMORY):
+        return True
+    cause = error.__cause__ or error.__context__  # a capture that is broken off complains of that, too
+    return cause is not None and is_out_of_memory(cause)
 
 
 @contextlib.contextmanager
@@ -203,7 +194,7 @@ class CapturedRollout:
         self._model = simulator
         if self._dtype is not None and kind == "cuda":
             self._model = copy.copy(simulator)
-            parts = {name: rounded(part, self._dtype) for name, part in _parts_of(simulator).items()}
+            parts = {name: rounded(getattr(simulator, name), self._dtype) for name in ROUNDED_PARTS}
             self._model.__dict__["_modules"] = {**simulator._modules, **parts}
         self.captures = 0
         self._launched = self._is_stale = False
@@ -257,8 +248,9 @@ class CapturedRollout:
         found, moving, counted = self._arrive()
         while moving > self._moving or not self._fits(found):
             self._moving = max(self._moving, self._capacity_for(moving))
-            needed = zip(self._grown(found), self._observed(), strict=True)
-            self._resize([a.grown((0, *b.sizes)) for a, b in needed])
+            calls = zip(self._capacities, found, strict=True)
+            grown = [capacity.grown(numbers, self._factor) for capacity, numbers in calls]
+            self._resize([a.grown((0, *b.sizes)) for a, b in zip(grown, self._observed(), strict=True)])
             self._replay()
             found, moving, counted = self._arrive()
         self._records.replayed(self._report, counted)
@@ -268,12 +260,8 @@ class CapturedRollout:
         """Reads the weights of the simulator again, and makes the background anew in the next call."""
         self._is_stale = True
         if self._model is not self._simulator:
-            with torch.no_grad():
-                for own, given in zip(
-                    _parts_of(self._model).values(), _parts_of(self._simulator).values(), strict=True
-                ):
-                    for name, value in given.state_dict().items():
-                        own.state_dict()[name].copy_(value)
+            for name in ROUNDED_PARTS:
+                getattr(self._model, name).load_state_dict(getattr(self._simulator, name).state_dict())
 
     # ---- what runs ----
 
@@ -384,10 +372,6 @@ class CapturedRollout:
         found, moving, counted = self._on_host.clone().tensor_split([n := self._found.numel(), n + 1])
         return found.view(self._found.shape).tolist(), int(moving), counted
 
-    def _grown(self, found: list[list[int]]) -> list[PyramidCapacity]:
-        calls = zip(self._capacities, found, strict=True)
-        return [capacity.grown(numbers, self._factor) for capacity, numbers in calls]
-
     # ---- what goes in and comes out ----
 
     def _load_parts(self, parts: Partition) -> Particles:
@@ -395,11 +379,10 @@ class CapturedRollout:
         own = self._frozen.partition
         self._check(parts.moving, own.moving.clouds, " in what moves")
         background = parts.background.row_fields()
-        changed = self._is_stale or not all(
-            torch.equal(background[n], x) for n, x in own.background.row_fields().items()
-        )
-        for mine, given in ((own.newest, parts.newest), (own.background, parts.background)):
-            _copy(mine, given)
+        own_background = own.background.row_fields()
+        changed = self._is_stale or not all(torch.equal(background[name], x) for name, x in own_background.items())
+        _copy(own.newest, parts.newest)
+        _copy(own.background, parts.background)
         own.rows.copy_(parts.rows)
         if changed:
             self._is_stale = False
@@ -414,8 +397,7 @@ class CapturedRollout:
         if (table.starts, table.scenes) != (own.starts, own.scenes):
             raise InputError(
                 f"CapturedRollout: state must have the rows and scenes of the first one{where}, clouds that start at "
-                f"rows {list(own.starts)} of scenes {list(own.scenes)}; got {list(table.starts)} "
-                f"of {list(table.scenes)}"
+                f"rows {[*own.starts]} of scenes {[*own.scenes]}; got {[*table.starts]} of {[*table.scenes]}"
             )
         if _gaps(table) != _gaps(own):
             raise InputError(
@@ -490,11 +472,6 @@ def of_prepared_state(plan: Plan) -> Plan:
         return plan
     dynamics = dataclasses.replace(plan.spec.dynamics, background="frozen")
     return dataclasses.replace(plan, spec=dataclasses.replace(plan.spec, dynamics=dynamics))
-
-
-def _parts_of(simulator: nn.Module) -> dict[str, nn.Module]:
-    """What a rollout reads."""
-    return {"dynamics": simulator.dynamics, "renderer": simulator.renderer}
 
 
 def rounded(module: nn.Module, dtype: torch.dtype) -> nn.Module:

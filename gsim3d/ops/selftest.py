@@ -13,6 +13,11 @@ from gsim3d.cameras import Cameras
 TOLERANCE = 1e-4  # float32, relative to the largest value of the expected tensor
 
 
+def _require_equal(got: Tensor, expected: Tensor, otherwise: str) -> None:
+    if not torch.equal(got.cpu(), expected):
+        raise AssertionError(otherwise)
+
+
 def _compare(device: str, function: Callable[..., Tensor], reference: Callable[..., Tensor], *inputs: Tensor) -> float:
     """Worst error of output and gradients relative to the largest expected value; raises above TOLERANCE."""
     results = []
@@ -53,14 +58,11 @@ def _curve(device: str) -> float:
     for bit in range(16):
         for axis in range(3):
             expected |= ((grid[:, axis] >> bit) & 1) << (3 * bit + 2 - axis)
-    codes = ops.curve_encode(grid.to(device), cloud.to(device), "z").cpu()
-    if not torch.equal(codes, expected):
-        raise AssertionError("z codes differ from bit interleaving")
-    order, inverse = ops.curve_sort(codes[None].to(device))
-    if not torch.equal(order[0].cpu(), torch.argsort(expected, stable=True)):
-        raise AssertionError("the order is not that of a stable sort")
-    if not torch.equal(order[0][inverse[0]].cpu(), torch.arange(200)):
-        raise AssertionError("inverse is not the inverse of order")
+    codes = ops.curve_encode(grid.to(device), cloud.to(device), "z")
+    _require_equal(codes, expected, "z codes differ from bit interleaving")
+    order, inverse = ops.curve_sort(codes[None])
+    _require_equal(order[0], torch.argsort(expected, stable=True), "the order is not that of a stable sort")
+    _require_equal(order[0][inverse[0]], torch.arange(200), "inverse is not the inverse of order")
     stages = _cloud(device).stages
     if sum(len(stage.voxels.rows) for stage in stages) != sum(len(stage.grid) for stage in stages):
         raise AssertionError("the voxels of a stage do not hold each row once")
@@ -173,15 +175,12 @@ def _plane_sweep(device: str) -> float:
     def reference(features: Tensor) -> Tensor:
         costs = []
         for image, source in ((0, 1), (1, 0)):
-            q = (
-                torch.einsum("ij,hwj->hwi", A[image].float(), pixels) / depths[image, :, None, None, None]
-                + b[image].float()
-            )
+            rays = torch.einsum("ij,hwj->hwi", A[image].float(), pixels)
+            q = rays / depths[image, :, None, None, None] + b[image].float()
             xy = q[..., :2] / q[..., 2:].clamp_min(1e-3)
             xy = 2 * xy / torch.tensor([width - 1, height - 1]) - 1
-            warped = torch.nn.functional.grid_sample(
-                features[source].expand(len(depths[image]), -1, -1, -1), xy, align_corners=True
-            )
+            other = features[source].expand(len(depths[image]), -1, -1, -1)
+            warped = torch.nn.functional.grid_sample(other, xy, align_corners=True)
             costs.append((features[image][None] * warped).sum(1) / features.shape[1] ** 0.5)
         return torch.stack(costs)
 
@@ -202,13 +201,11 @@ def _raster(device: str) -> float:
         image, transmittance = torch.zeros(size, size, 3), torch.ones(size, size)
         for i in range(n):
             x, y, z = means[i]
-            J = torch.stack(
-                [torch.stack([focal / z, 0 * z, -focal * x / z**2]), torch.stack([0 * z, focal / z, -focal * y / z**2])]
-            )
+            slopes = focal / z, 0 * z, -focal * x / z**2, 0 * z, focal / z, -focal * y / z**2
+            J = torch.stack(slopes).reshape(2, 3)
             conic = torch.linalg.inv(J @ torch.diag(scales[i] ** 2) @ J.T + 0.3 * torch.eye(2))
-            offset = torch.stack(torch.meshgrid(pixel, pixel, indexing="xy"), -1) - torch.stack(
-                [focal * x / z + K[0, 2], focal * y / z + K[1, 2]]
-            )
+            center = torch.stack([focal * x / z + K[0, 2], focal * y / z + K[1, 2]])
+            offset = torch.stack(torch.meshgrid(pixel, pixel, indexing="xy"), -1) - center
             power = -0.5 * torch.einsum("hwi,ij,hwj->hw", offset, conic, offset)
             alpha = (opacities[i] * power.exp()).clamp_max(0.99)
             alpha = torch.where(alpha >= 1 / 255, alpha, 0.0)
@@ -247,18 +244,18 @@ def _background(device: str) -> float:
     cells = torch.cat([keys[::2].unique(), torch.tensor([torch.iinfo(torch.int64).max])])
     places = ops.find_cells(*(t.to(device) for t in (cells, scene, grid)))
     equal = keys[:, None] == cells
-    if not torch.equal(places.cpu(), torch.where(equal.any(1), equal.int().argmax(1), len(cells) - 1)):
-        raise AssertionError("cells are found in other places than by comparing all")
+    expected = torch.where(equal.any(1), equal.int().argmax(1), len(cells) - 1)
+    _require_equal(places, expected, "cells are found in other places than by comparing all")
     one_by_one = ops.Segments(torch.arange(40, device=device), torch.arange(41, device=device))
     clouds = torch.tensor([0, 1], device=device), torch.tensor([0, 20, 40], device=device)
-    if not torch.equal(ops.row_scenes(*clouds, [one_by_one])[0].cpu(), scene):
-        raise AssertionError("rows are in other scenes than their clouds")
+    _require_equal(ops.row_scenes(*clouds, [one_by_one])[0], scene, "rows are in other scenes than their clouds")
     codes, cu = torch.stack([torch.randperm(40, generator=torch.Generator().manual_seed(1))]), torch.tensor([0, 5, 9])
     first, order = torch.tensor([[0, 20]]), codes.argsort(1)
     lists = (first, torch.arange(9)[None], cu, codes, order, torch.tensor([0, 40]))
     table = ops.overlapping_patches(*(t.to(device) for t in lists), patch_size=20)[0]
-    if not torch.equal(table.q_rows.cpu(), order[0]) or table.cu_q[:3].tolist() != [0, 20, 40]:
-        raise AssertionError("rows are in other patches than those in whose intervals they lie")
+    wrong = "rows are in other patches than those in whose intervals they lie"
+    _require_equal(table.q_rows, order[0], wrong)
+    _require_equal(table.cu_q[:3], torch.tensor([0, 20, 40]), wrong)
     x, field = _random(40, 6), _random(len(cells), 6, seed=1)
     return _compare(device, lambda x, f: ops.add_cells(x, f, places), lambda x, f: x + f[places.cpu()], x, field)
 
@@ -271,19 +268,17 @@ def _validate_state(device: str) -> float:
     arguments = [means.to(device), opacities.to(device)], [(-9, 9), (0, 1)], cu_rows.to(device)
     options = {name: value.to(device) for name, value in clouds.items()}
     found, parts = ops.validate_state(*arguments, **options), ops.validate_state(*arguments, **options, join=False)
-    if not torch.equal(ops.join_records([parts.record]).reshape(found.record.shape), found.record):
-        raise AssertionError("the parts of a record do not join")
+    record = found.record.cpu()
+    joined = ops.join_records([parts.record]).reshape(record.shape)
+    _require_equal(joined, record, "the parts of a record do not join")
     bad = (~(means.abs() <= 9).all(1)).int() | (opacities > 1).int() << 1
-    if not torch.equal(found.status.cpu(), bad) or found.record[:, :4].tolist() != [
-        [1, 7, 0, -1],
-        [0, -1, 1, 30],
-    ]:
-        raise AssertionError("rows that cannot be used are not those that are out of bounds")
-    awake = [(bad == 0)[:20].sum(), (bad == 0)[20:].sum()]
-    if found.record[:, 8].tolist() != [float(n) for n in awake]:
-        raise AssertionError("rows that are awake are counted wrongly")
+    wrong = "rows that cannot be used are not those that are out of bounds"
+    _require_equal(found.status, bad, wrong)
+    _require_equal(record[:, :4], record.new_tensor([[1, 7, 0, -1], [0, -1, 1, 30]]), wrong)
+    awake = torch.stack([(bad == 0)[:20].sum(), (bad == 0)[20:].sum()]).double()
+    _require_equal(record[:, 8], awake, "rows that are awake are counted wrongly")
     opacity = torch.stack([opacities[:20].double().sum(), opacities[20:][opacities[20:] <= 1].double().sum()])
-    return float(((found.record[:, 10].cpu() - opacity) / opacity).abs().max())
+    return float(((record[:, 10] - opacity) / opacity).abs().max())
 
 
 CHECKS: dict[str, Callable[[str], float]] = {
