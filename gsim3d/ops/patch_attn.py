@@ -48,15 +48,10 @@ def patch_attention(
         tensor([0., 6., 6.])
     """
     if check:
-        lists = {name: getattr(table, name) for name in ("q_rows", "kv_rows", "cu_q", "cu_k")}
-        check_tensors("patch_attention", q=q, k=k, v=v, **lists)
+        check_tensors("patch_attention", q=q, k=k, v=v, **_lists(table))
         check_real("patch_attention", **({} if scale is None else {"scale": scale}))
         check_numbers("patch_attention", q=q, k=k, v=v)
-    if scale is None:
-        scale = q.shape[-1] ** -0.5 if q.dim() and q.shape[-1] else 1.0
-    return torch.ops.gsim3d.patch_attention(q, k, v, table.q_rows, table.kv_rows, table.cu_q, table.cu_k, float(scale))[
-        0
-    ]
+    return torch.ops.gsim3d.patch_attention(q, k, v, *_lists(table).values(), _scale(q, scale))[0]
 
 
 def joint_attention(
@@ -92,17 +87,22 @@ def joint_attention(
         tensor([3., 3.])
     """
     if check:
-        tables = {"": table, "other_": other_table}
-        names = ("q_rows", "kv_rows", "cu_q", "cu_k")
-        lists = {f"{p}{name}": getattr(t, name) for p, t in tables.items() for name in names}
         numbers = {"q": q, "k": k, "v": v, "other_k": other_k, "other_v": other_v}
-        check_tensors("joint_attention", **numbers, **lists)
+        check_tensors("joint_attention", **numbers, **_lists(table), **_lists(other_table, "other_"))
         check_real("joint_attention", **({} if scale is None else {"scale": scale}))
         check_numbers("joint_attention", **numbers)
-    if scale is None:
-        scale = q.shape[-1] ** -0.5 if q.dim() and q.shape[-1] else 1.0
-    lists = (x for t in (table, other_table) for x in (t.q_rows, t.kv_rows, t.cu_q, t.cu_k))
-    return torch.ops.gsim3d.joint_attention(q, k, v, other_k, other_v, *lists, float(scale))[0]
+    lists = *_lists(table).values(), *_lists(other_table).values()
+    return torch.ops.gsim3d.joint_attention(q, k, v, other_k, other_v, *lists, _scale(q, scale))[0]
+
+
+def _lists(table: PatchTable, prefix: str = "") -> dict[str, Tensor]:
+    return {f"{prefix}{name}": getattr(table, name) for name in ("q_rows", "kv_rows", "cu_q", "cu_k")}
+
+
+def _scale(q: Tensor, scale: float | None) -> float:
+    if scale is not None:
+        return float(scale)
+    return q.shape[-1] ** -0.5 if q.dim() and q.shape[-1] else 1.0
 
 
 @fake("patch_attention")

@@ -70,8 +70,9 @@ def compare_sleep(
     log = RestLog()
     steps = simulator.rollout(state, n_steps, plan, log=log)
     others = simulator.rollout(state, n_steps, simulator.plan(awake))
-    moved = tuple(_distances(a, b).max().item() if a.n_rows else 0.0 for a, b in zip(steps, others, strict=True))
-    psnr = () if cameras is None else tuple(_psnr(simulator, a, b, cameras) for a, b in zip(steps, others, strict=True))
+    pairs = list(zip(steps, others, strict=True))
+    moved = tuple(_distances(a, b).max().item() if a.n_rows else 0.0 for a, b in pairs)
+    psnr = () if cameras is None else tuple(_psnr(simulator, a, b, cameras) for a, b in pairs)
     return SleepError(moved, psnr, log)
 
 

@@ -103,6 +103,12 @@ class Subject:
     restored: Restored | None = None
     known: dict[str, dict] = dataclasses.field(default_factory=dict)
 
+    def sample(self, frames: Frames, targets: Cameras, n_steps: int = SHORT) -> Sample:
+        """The sample of these images on the simulator's device, with the plan that it was trained for."""
+        device = next(self.simulator.parameters()).device
+        plan = self.restored.plan if self.restored else None
+        return Sample(frames.to(device), targets.to(device), n_steps, plan)
+
 
 def is_checkpoint(path: Path) -> bool:
     """Whether ``path`` is a run folder, a checkpoint folder or an exported file."""
@@ -153,7 +159,7 @@ def sample_of_scenes(subject: Subject, folders: Sequence[Path], full: bool = Fal
         frames = _subsampled(frames)
     elif subject.restored is not None:
         frames = subsampled(frames, subject.restored.data)
-    return _sample(subject, frames), problems
+    return subject.sample(frames, _first_cameras(frames)), problems
 
 
 def _views(subject: Subject, scene: Scene, count: int | None = None) -> list[int]:
@@ -174,7 +180,7 @@ def random_sample(subject: Subject) -> Sample:
     centers = [np.array([2.0 * math.cos(angle), 2.0 * math.sin(angle), 1.0]) for angle in angles]
     viewmats = torch.from_numpy(np.stack([look_at(center, np.zeros(3)) for center in centers])).float()
     K = torch.tensor([[1.2 * size[0], 0, size[0] / 2], [0, 1.2 * size[0], size[1] / 2], [0, 0, 1]])
-    n = n_clouds * n_views
+    n, pixels = n_clouds * n_views, size[::-1]
     cameras = Cameras(
         viewmats.repeat(n_clouds, 1, 1),
         K.repeat(n, 1, 1),
@@ -184,15 +190,15 @@ def random_sample(subject: Subject) -> Sample:
         *size,
     )
     frames = Frames(
-        images=torch.rand(n, 3, size[1], size[0], generator=generator),
+        images=torch.rand(n, 3, *pixels, generator=generator),
         cameras=cameras,
         cloud_scene=torch.repeat_interleave(torch.arange(2), torch.tensor(n_steps)),
         cloud_step=torch.cat([torch.arange(steps) for steps in n_steps]),
         origin=torch.full((2, 3), -5.0, dtype=torch.float64),
-        masks=torch.rand(n, size[1], size[0], generator=generator) < 0.3,
-        dynamic=torch.rand(n, size[1], size[0], generator=generator) < 0.7,
+        masks=torch.rand(n, *pixels, generator=generator) < 0.3,
+        dynamic=torch.rand(n, *pixels, generator=generator) < 0.7,
     )
-    return _sample(subject, _subsampled(frames))
+    return subject.sample(_subsampled(frames), _first_cameras(frames))
 
 
 def _subsampled(frames: Frames) -> Frames:
@@ -203,14 +209,11 @@ def _subsampled(frames: Frames) -> Frames:
     return dataclasses.replace(frames, masks=kept & ((number - 1) % every == 0).view(kept.shape))
 
 
-def _sample(subject: Subject, frames: Frames) -> Sample:
-    """``frames`` as a sample whose target cameras are those of the first step of every scene."""
+def _first_cameras(frames: Frames) -> Cameras:
+    """The cameras of the first step of every scene; ``image_cloud`` is the scene of each."""
     scene_of_image = frames.cloud_scene[frames.cameras.image_cloud]
     first = (frames.cloud_step[frames.cameras.image_cloud] == 0).nonzero()[:, 0]
-    targets = frames.cameras.select(first, scene_of_image[first])
-    device = next(subject.simulator.parameters()).device
-    plan = subject.restored.plan if subject.restored else None
-    return Sample(frames.to(device), targets.to(device), SHORT, plan)
+    return frames.cameras.select(first, scene_of_image[first])
 
 
 def check(
@@ -301,10 +304,9 @@ def write_report(report: Report, out: Path) -> None:
             lines += [f"- {deviation}" for deviation in finding.failures[:20]]
             lines += [f"- and {more} more"] if (more := len(finding.failures) - 20) > 0 else []
             lines += ["", f"Again: `gsim3d doctor --stability --replay {finding.file}`"]
-    text = "\n".join(lines) + "\n"
     plain = _plain({"healthy": report.healthy, **dataclasses.asdict(report)})
-    for name, content in {"report.md": text, "report.json": json.dumps(plain, indent=1) + "\n"}.items():
-        write_whole(out / name, content)
+    for name, content in {"report.md": "\n".join(lines), "report.json": json.dumps(plain, indent=1)}.items():
+        write_whole(out / name, content, "\n")
 
 
 def _plain(value: Any) -> Any:
@@ -387,9 +389,7 @@ def replay(path: str | Path, device: str = "cpu") -> Report:
     """The report of the check that a file reproduces, on the model that it names."""
     sample, what = load_sample(path)
     subject = open_subject(what.get("checkpoint") or what["preset"].partition(",")[0], device)
-    plan = subject.restored.plan if subject.restored else None
-    on = next(subject.simulator.parameters()).device
-    sample = dataclasses.replace(sample, frames=sample.frames.to(on), targets=sample.targets.to(on), plan=plan)
+    sample = subject.sample(sample.frames, sample.targets, sample.n_steps)
     findings = [finding for finding, _ in check(subject, sample, sample.n_steps, [what["check"]])]
     return Report(subject.origin | {"replayed": str(path)}, (), tuple(findings))
 
