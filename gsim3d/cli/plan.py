@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from gsim3d.cli.arguments import add_fitting
-from gsim3d.pretrained import CHECKPOINT_HELP, located
+from gsim3d.pretrained import CHECKPOINT_HELP, folder_of
 
 EPILOG = """\
 Without --effects the spec is effects.yaml of the scene or of the data set around it, else that of the checkpoint,
@@ -43,9 +43,9 @@ def run(args: argparse.Namespace) -> int:
         simulator = build_simulator(presets.tiny(), seed=0)
         own, source = simulator.plan(), "none, so the model's own"
     else:
-        restored, path = restore(args.checkpoint), located(args.checkpoint)
+        restored = restore(args.checkpoint)
         scene = restored.open_scene(args.scene, args.keep, args.resample)
-        times = load_times(path if path.is_dir() else path.parent, restored)
+        times = load_times(folder_of(args.checkpoint), restored)
         data, simulator = restored.data_of(scene), restored.simulator
         own, source = restored.plan, "the checkpoint's"
     spec = EffectsSpec.of_scene(args.scene)

@@ -32,6 +32,11 @@ def current_model(section: dict[str, Any]) -> dict[str, Any]:
     return section
 
 
+def current_data(section: dict[str, Any]) -> dict[str, Any]:
+    """A saved ``data`` section without ``near_far`` where it is text, "of each scene", as version 0.1 wrote."""
+    return {name: value for name, value in section.items() if name != "near_far" or not isinstance(value, str)}
+
+
 def _is_released(section: dict[str, Any]) -> bool:
     """Takes the switches for published behaviour out of all parts; whether they were on."""
     said = {}

@@ -55,7 +55,7 @@ def generator(seed: int, step: int, sample: int, purpose: str) -> np.random.Gene
 
 
 def make_frames(
-    scenes: Sequence[Scene], cams_per_scene: Sequence, steps_per_scene: Sequence, *, masked: bool = True
+    scenes: Sequence[Scene], cams_per_scene: Sequence, steps_per_scene: Sequence, *, masked: bool | None = None
 ) -> Frames:
     """Images of some cameras at some steps of some scenes, packed cloud after cloud.
 
@@ -67,7 +67,7 @@ def make_frames(
         cams_per_scene: for each scene its camera numbers, the same at every step, or one list a step.
         steps_per_scene: for each scene its step numbers.
         masked: also read the labels: masks = not background, dynamic = bodies that may move. Otherwise masks leave
-            out only what was not recorded (padding, borders of undistorted images).
+            out only what was not recorded (padding, borders of undistorted images). None: where all scenes have labels.
 
     Raises:
         InputError: missing files, numbers out of range, and scenes whose image sizes differ.
@@ -77,6 +77,7 @@ def make_frames(
             "make_frames needs one list of cameras and one of steps for each of one or more scenes; "
             f"got {len(scenes)} scenes, {len(cams_per_scene)} and {len(steps_per_scene)} lists"
         )
+    masked = all(scene.has_segmentation() for scene in scenes) if masked is None else masked
     images, labels, valid, cameras, cloud_scene, cloud_step, image_cloud = [], [], [], [], [], [], []
     for number, (scene, cams, steps) in enumerate(zip(scenes, cams_per_scene, steps_per_scene)):
         _check_size(scene, scenes[0])

@@ -220,7 +220,7 @@ class Scene:
             n = min(inputs.context_views, len(allowed))
             cams = sorted(allowed[k * len(allowed) // n] for k in range(n))
         steps = range(start, start + inputs.history)
-        return make_frames([self], [list(cams)], [steps], masked=self.has_segmentation())
+        return make_frames([self], [list(cams)], [steps])
 
     def _numbers(self, cams, steps) -> tuple[list[int], list[int]]:
         cams, steps = [int(c) for c in cams], [int(s) for s in steps]

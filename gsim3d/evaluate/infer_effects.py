@@ -9,7 +9,6 @@ from dataclasses import dataclass, fields, replace
 from statistics import fmean
 
 import numpy as np
-import torch
 
 from gsim3d.data import Scene
 from gsim3d.dynamics import concatenate, last_steps
@@ -17,7 +16,6 @@ from gsim3d.effects.plan import make_plan
 from gsim3d.effects.spec import EffectsSpec
 from gsim3d.evaluate.protocol import default_views, encode_steps, horizon, render_steps
 from gsim3d.io.terminal import in_columns
-from gsim3d.nn.layers import exact_convolutions
 from gsim3d.presets import ModelConfig
 from gsim3d.train.restore import Restored
 
@@ -163,9 +161,10 @@ class Trial:
 
     def __call__(self, spec: EffectsSpec) -> Measured:
         restored, times = replace(self.restored, plan=self.restored.simulator.plan(spec)), []
+        predict, n_steps = restored.simulator.predict, self.n_steps
         for _ in range(ROUNDS):
             start = time.perf_counter()
-            psnr = self._psnr(restored, lambda state: restored.simulator.rollout(state, self.n_steps, restored.plan))
+            psnr = self._psnr(restored, lambda state: predict(state, n_steps, restored.plan).steps)
             times.append(time.perf_counter() - start)
         self.bar.total = max(self.bar.total, self.bar.n + 1)  # combinations of settings may be tried several times
         self.bar.update()
@@ -183,8 +182,7 @@ class Trial:
     def _psnr(self, restored: Restored, predict: Callable) -> float:
         """PSNR of ``predict`` (state -> the next steps); waits for the device."""
         errors = []
-        with torch.no_grad(), exact_convolutions():
-            for state, video, first in zip(self.states, self.videos, self.first, strict=True):
-                images = render_steps(restored, concatenate(predict(state)), self.scene, self.cams, first)
-                errors.append(float((images - video).square().mean()))
+        for state, video, first in zip(self.states, self.videos, self.first, strict=True):
+            images = render_steps(restored, concatenate(predict(state)), self.scene, self.cams, first)
+            errors.append(float((images - video).square().mean()))
         return -10 * math.log10(max(fmean(errors), 1e-10))

@@ -15,7 +15,7 @@ from gsim3d.evaluate.protocol import check_cameras, default_views, horizon, scor
 from gsim3d.evaluate.report import markdown, summarize, table, write_csv, write_json
 from gsim3d.evaluate.scoring import SceneScores, measurable
 from gsim3d.io.files import output_path, with_parents, write_whole
-from gsim3d.pretrained import FOLDER, located
+from gsim3d.pretrained import FOLDER, folder_of
 from gsim3d.synth.held_out import set_of
 from gsim3d.train.processes import Processes, joined
 from gsim3d.train.restore import Restored, restore
@@ -140,10 +140,10 @@ def _evaluate(job: Job, metrics: tuple, not_measured: dict, against: dict | None
 def _report_path(job: Job, others: list[Predictions]) -> Path:
     if job.out:
         return output_path(job.out, ".json")
-    place = located(job.checkpoint) if job.checkpoint else Path(others[0].folder)
+    place = folder_of(job.checkpoint) if job.checkpoint else Path(others[0].folder)
     if place.is_relative_to(FOLDER):  # nothing is written into the package
         return Path("metrics.json")
-    return (place if place.is_dir() else place.parent) / "metrics.json"
+    return place / "metrics.json"
 
 
 def _open_scenes(job: Job, restored: Restored | None) -> tuple[list[Scene], dict]:

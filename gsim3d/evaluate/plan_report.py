@@ -69,7 +69,7 @@ def workload(scene: Scene, data: DataConfig) -> Workload:
     """Particles of the first step of ``scene`` as a model trained on ``data`` sees it, and one image."""
     cameras = context_cameras(scene, data)
     views = spread_views(cameras, min(data.context_views, len(cameras)), 0)
-    frames = subsampled(make_frames([scene], [list(views)], [range(1)], masked=scene.has_segmentation()), data)
+    frames = subsampled(make_frames([scene], [list(views)], [range(1)]), data)
     moving = kept = frames.images.shape[0] * scene.height * scene.width
     if frames.masks is not None:
         moving = kept = int(frames.masks.sum())

@@ -233,8 +233,8 @@ def input_frames(
             )
     if most is not None:
         contexts = [[cams[k * len(cams) // most] for k in range(min(most, len(cams)))] for cams in contexts]
-    masked, steps = all(scene.has_segmentation() for scene in scenes), range(start, start + n_encoded)
-    return make_frames(scenes, [list(cams) for cams in contexts], [steps] * len(scenes), masked=masked)
+    steps = [range(start, start + n_encoded)] * len(scenes)
+    return make_frames(scenes, [list(cams) for cams in contexts], steps)
 
 
 @torch.no_grad()

@@ -45,6 +45,12 @@ def located(checkpoint: str | Path) -> Path:
     raise InputError(f"{checkpoint}: no such checkpoint ({known}{did_you_mean(checkpoint, names())})")
 
 
+def folder_of(checkpoint: str | Path) -> Path:
+    """The folder in or beside which the weights of a checkpoint are. Raises InputError as :func:`located`."""
+    path = located(checkpoint)
+    return path if path.is_dir() else path.parent
+
+
 def frame_rate(checkpoint: str | Path) -> float | None:
     """Frames per second of the training of a simulator that comes with gsim3d; None: of others, or not stated.
 
@@ -53,6 +59,6 @@ def frame_rate(checkpoint: str | Path) -> float | None:
     config = located(checkpoint).resolve().parent / CONFIG
     if not config.is_relative_to(FOLDER.resolve()) or not config.is_file():
         return None
-    import yaml
+    from gsim3d.io.files import read_yaml
 
-    return yaml.safe_load(config.read_text())["data"].get("fps")
+    return read_yaml(config)["data"].get("fps")

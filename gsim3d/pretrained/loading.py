@@ -18,7 +18,7 @@ from torch.overrides import TorchFunctionMode
 
 from gsim3d import pretrained
 from gsim3d.cameras import InputSpec
-from gsim3d.compat.checkpoints import current_model, current_weights
+from gsim3d.compat.checkpoints import current_data, current_model, current_weights
 from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError
 from gsim3d.io import checkpoint
@@ -69,10 +69,8 @@ def load(
     if cls is None:
         wanted = "gsim3d.compat.load_released" if released else "Simulator.from_pretrained"
         raise InputError(f"{name_or_path}: a checkpoint of another kind of model; load it with {wanted}")
-    folder = pretrained.located(name_or_path)
-    folder = folder if folder.is_dir() else folder.parent
     try:
-        setting = load_speed(folder, saved.digest, torch.device(device).type, speed)
+        setting = load_speed(pretrained.folder_of(name_or_path), saved.digest, torch.device(device).type, speed)
         found = describe(saved.config, cls.config_class, pretrained.frame_rate(name_or_path))
         simulator = with_weights(cls, setting.of_model(found.model), found.effects, saved.weights)
     except InputError as error:
@@ -114,9 +112,7 @@ def describe(config: dict[str, Any], kind: type[ModelConfig] = ModelConfig, fps:
     model = from_dict(kind, current_model(config["model"]), "model")
     effects = EffectsSpec.from_dict(config.get("effects", {}).get("spec"))
     names = {field.name for field in dataclasses.fields(InputSpec)}
-    data = {key: value for key, value in config["data"].items() if key in names and value is not None}
-    if isinstance(data.get("near_far"), str):  # "of each scene", as version 0.1 wrote
-        data.pop("near_far")
+    data = {key: value for key, value in current_data(config["data"]).items() if key in names and value is not None}
     given = data.pop("fps", None)
     fps = fps if given is None else given
     if fps is not None and (isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 1e-3 <= fps <= 1e6):

@@ -25,7 +25,7 @@ from gsim3d.io.files import write_whole
 from gsim3d.io.locks import only_one_writer
 from gsim3d.io.terminal import in_columns
 from gsim3d.numerics.speed import SPEEDS_FILE
-from gsim3d.pretrained import located
+from gsim3d.pretrained import folder_of
 from gsim3d.profile.autotune import part_times, save_speeds, tune
 from gsim3d.profile.settings import GROUPS, KINDS, Group
 from gsim3d.profile.sweep import (
@@ -129,7 +129,7 @@ def profile(
             "not_measured": {**case.not_measured, **not_measured},
         }
         files = write(out, case, points, presets, content)
-        files.append(_keep_speeds(located(checkpoint), out, restored, presets, part_times(case, points[0])))
+        files.append(_keep_speeds(folder_of(checkpoint), out, restored, presets, part_times(case, points[0])))
     return content, files
 
 
@@ -147,12 +147,12 @@ def _scenes(restored: Restored, data: str, which: str, count: int | None) -> lis
     return [restored.open_scene(folder) for folder in folders[:count]]
 
 
-def _keep_speeds(checkpoint: Path, out: Path, *kept) -> Path:
-    """Beside the checkpoint, where ``--speed`` reads them; in ``out`` where nothing can be written there."""
+def _keep_speeds(folder: Path, out: Path, *kept) -> Path:
+    """In the checkpoint's ``folder``, where ``--speed`` reads them; in ``out`` where nothing can be written there."""
     try:
-        return save_speeds(checkpoint if checkpoint.is_dir() else checkpoint.parent, *kept)
+        return save_speeds(folder, *kept)
     except OSError as error:
-        print(f"{error.filename or checkpoint}: {error.strerror}; copy {SPEEDS_FILE} there, for gsim3d simulate")
+        print(f"{error.filename or folder}: {error.strerror}; copy {SPEEDS_FILE} there, for gsim3d simulate")
         return save_speeds(out, *kept)
 
 

@@ -153,8 +153,7 @@ def sample_of_scenes(subject: Subject, folders: Sequence[Path], full: bool = Fal
     longest = 2**subject.simulator.config.dynamics.history_bits
     history = min(longest if full else MAX_HISTORY, longest, *(scene.n_steps for scene in scenes))
     cams = [_views(subject, scene, FULL_VIEWS if full else None) for scene in scenes]
-    masked = all(scene.has_segmentation() for scene in scenes)
-    frames = make_frames(scenes, cams, [range(history)] * len(scenes), masked=masked)
+    frames = make_frames(scenes, cams, [range(history)] * len(scenes))
     if not full:
         frames = _subsampled(frames)
     elif subject.restored is not None:

@@ -143,8 +143,8 @@ def sample_video(
     """uint8 [T, H, 2 W, 3]: the first window of ``scene`` seen by one camera, recorded and predicted."""
     n_past = phase.history or data.history
     steps, cams = range(n_past + phase.horizon), context_cameras(scene, data)
-    views, masked = spread_views(cams, data.context_views, 0), scene.has_segmentation()
-    frames = make_frames([scene], [views], [list(steps[:n_past])], masked=masked)
+    views = spread_views(cams, data.context_views, 0)
+    frames = make_frames([scene], [views], [list(steps[:n_past])])
     simulator.eval()
     try:
         state = simulator.encode(subsampled(frames, data).to(device), on_invalid="drop")

@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from gsim3d import presets
-from gsim3d.compat.checkpoints import SWITCHES, current_model
+from gsim3d.compat.checkpoints import SWITCHES, current_data, current_model
 from gsim3d.compat.released_model import ReleasedModelConfig, ReleasedSimulator, simulator_class
 from gsim3d.data import Scene
 from gsim3d.data.fitting import frame_stride
@@ -206,9 +206,7 @@ def restore(path: str | Path, device: str = "cpu", speed: str = "exact") -> Rest
         InputError: as there, or the training's data settings are not of this version.
     """
     simulator, saved = loading.load((Simulator, ReleasedSimulator), path, device, speed)
-    data = {key: value for key, value in saved.config["data"].items() if key not in ("image_size", "fps")}
-    if isinstance(data.get("near_far"), str):  # "of each scene", as version 0.1 wrote
-        data.pop("near_far")
+    data = {key: value for key, value in current_data(saved.config["data"]).items() if key not in ("image_size", "fps")}
     try:
         settings = from_dict(DataConfig, upgraded(DataConfig, data), "data")
     except InputError as error:

@@ -119,11 +119,10 @@ def draw_batch(
     """
     windows = draw_windows(scenes, data, phase, seed, step, samples)
     n_context, chosen = windows[0].n_context, [window.scene for window in windows]
-    masked = all(scene.has_segmentation() for scene in chosen)
     given = [window.steps[:n_context] for window in windows]
-    context = make_frames(chosen, [window.context_cams for window in windows], given, masked=masked)
+    context = make_frames(chosen, [window.context_cams for window in windows], given)
     target_cams, steps = [window.target_cams for window in windows], [window.steps for window in windows]
-    targets = make_frames(chosen, target_cams, steps, masked=masked)
+    targets = make_frames(chosen, target_cams, steps)
     return Batch(subsampled(context, data), targets, n_context, phase.horizon, phase.cut)
 
 
