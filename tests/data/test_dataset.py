@@ -54,10 +54,11 @@ def test_make_frames_without_labels(scenes, tmp_path):
         file.unlink()
     scene = Scene.open(tmp_path / "s0")
     assert not scene.has_segmentation()
-    frames = make_frames([scene], [[0]], [[0]], masked=False)
-    assert frames.masks is None and frames.dynamic is None
+    for masked in (False, None):
+        frames = make_frames([scene], [[0]], [[0]], masked=masked)
+        assert frames.masks is None and frames.dynamic is None
     with pytest.raises(InputError, match="no labels"):
-        make_frames([scene], [[0]], [[0]])
+        make_frames([scene], [[0]], [[0]], masked=True)
 
 
 def test_make_frames_errors(scenes, tmp_path):
