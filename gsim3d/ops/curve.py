@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 
 import torch
 from torch import Tensor
@@ -397,9 +398,7 @@ def build_pyramid(
             raise TypeError(f"build_pyramid: rounded must be true or false; got {rounded!r}")
     if curves is None:
         curves = ((0, 1, 2, 3),) * spec.n_stages
-    cu_kernels = [0]
-    for sizes in spec.kernel_sizes:
-        cu_kernels.append(cu_kernels[-1] + len(sizes))
+    cu_kernels = list(accumulate(map(len, spec.kernel_sizes), initial=0))
     arrays = torch.ops.gsim3d.build_pyramid(
         positions.detach(),
         cu_rows,
@@ -463,9 +462,7 @@ def _assemble(
 ) -> Pyramid:
     """Names the flat results, in the order that csrc/gsim3d/curve/pyramid.h states. ``counts``: rows of data of each
     stage, where that is not all and the host knows it."""
-    left = list(arrays)
-    left.reverse()
-    take = left.pop
+    take = list(reversed(arrays)).pop
     rows, cu_rows, stages = take(), take(), []
     for sizes, merged in zip(spec.kernel_sizes, spec.merged_bits(), strict=True):
         cluster = Segments(stages[-1].order[0], take()) if stages else None
@@ -508,16 +505,12 @@ def _(
     capacity,
     rounded=False,
 ):
-    given = iter(capacity)
-    new_size = torch.library.get_ctx().new_dynamic_size if not capacity else None
+    n_counts = len(PyramidCapacity.COUNTS) * len(patch_sizes)
+    of_stages, of_maps = iter(capacity[:n_counts]), iter(capacity[n_counts:])
 
-    def size():
-        return next(given) if capacity else new_size()
+    def size(given=of_stages, more=0):  # one symbol: an unbacked size must be the whole size of some result
+        return next(given) + more if capacity else torch.library.get_ctx().new_dynamic_size(min=more)
 
-    def size_and_one():  # one symbol: an unbacked size must be the whole size of some result
-        return next(given) + 1 if capacity else new_size(min=1)
-
-    pairs = iter(capacity[len(PyramidCapacity.COUNTS) * len(patch_sizes) :])
     n = size()
     arrays = [(n,), (n + 1,)]
     for s in range(len(patch_sizes)):
@@ -527,12 +520,12 @@ def _(
             merged = min(merge_windows[s - 1].bit_length() - 1, slot_bits)
             slot_bits -= merged
             arrays += [(n,)] if merged else []
-        clouds, patches, keys = size_and_one(), size_and_one(), size()
+        clouds, patches, keys = size(more=1), size(more=1), size()
         arrays += [(n, 3), (n,), (clouds,), (4, n), (patches,), (patches,), (4, keys)]
-        arrays += [(n,), (n,), (n + 2 if capacity else new_size(min=1),)]
+        arrays += [(n,), (n,), (n + 2 if capacity else size(more=1),)]
         for kernel_size in kernel_sizes[cu_kernels[s] : cu_kernels[s + 1]]:
-            n_pairs = next(pairs) if capacity else new_size()
+            n_pairs = size(of_maps)
             arrays += [(n_pairs,), (n_pairs,), (kernel_size**3 + 1,)]
     if capacity or rounded:
-        arrays.append((1 + len(PyramidCapacity.COUNTS) * len(patch_sizes) + len(kernel_sizes),))
+        arrays.append((1 + n_counts + len(kernel_sizes),))
     return [cu_rows.new_empty(shape) for shape in arrays]

@@ -137,11 +137,9 @@ def validate_state(
     if not join:
         shape = torch.Size((cu_rows.shape[0] - 1, record.shape[1]))
         record = PartialRecord(record, cu_rows, fields[0].shape[0], shape, record.dtype, record.device)
-    return (
-        ValidatedState(status, record, tuple(sanitized[1:]), sanitized[0])
-        if sanitized
-        else ValidatedState(status, record)
-    )
+    if not sanitized:
+        return ValidatedState(status, record)
+    return ValidatedState(status, record, tuple(sanitized[1:]), sanitized[0])
 
 
 def join_records(records: Sequence[PartialRecord]) -> Tensor:
