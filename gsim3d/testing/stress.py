@@ -94,19 +94,15 @@ def gradient_norms(
     state = state.detach()
     taps = []
     for _ in range(n_steps):
-        leaf = {name: getattr(state, name) for name in ("means", "dynamic_latents")}
-        leaf = {name: value if value.requires_grad else value.requires_grad_() for name, value in leaf.items()}
-        state = dataclasses.replace(state, **leaf)
-        taps.append(tuple(leaf.values()))
+        taps += [state.means.requires_grad_(), state.dynamic_latents.requires_grad_()]
         state = simulator.step(state, plan)
     loss = simulator.render(last_steps(state, 1), targets).color.square().mean()
     parameters = dict(simulator.named_parameters())
-    sources = [*(value for pair in taps for value in pair), *parameters.values()]
-    found = torch.autograd.grad(loss, sources, allow_unused=True)
-    squares = [0.0 if g is None else float(g.double().square().sum()) for g in found[: 2 * n_steps]]
+    found = torch.autograd.grad(loss, [*taps, *parameters.values()], allow_unused=True)
+    squares = [0.0 if g is None else float(g.double().square().sum()) for g in found[: len(taps)]]
     norms = [math.sqrt(a + b) for a, b in zip(squares[::2], squares[1::2], strict=True)]
-    gradients = dict(zip(parameters, found[2 * n_steps :], strict=True))
-    return norms, {name: value for name, value in gradients.items() if value is not None}
+    gradients = zip(parameters, found[len(taps) :], strict=True)
+    return norms, {name: value for name, value in gradients if value is not None}
 
 
 def _holds(what: str, ok: bool, where: str) -> Deviation:
