@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--table", metavar="FILE", help="YAML file of rows and base runs (default: the paper's)")
     add("--out", metavar="DIR", help="folder for the runs and the table; made if absent")
     add("--config", metavar="CONFIG", help="YAML file of the base run, as of gsim3d train (default: one of --preset)")
-    add("--preset", default="tiny", metavar="PRESET", help="base run without --config (default: %(default)s)")
+    add("--preset", metavar="PRESET", help="base run without --config (default: tiny)")
     add("--steps", type=whole(1), metavar="N", help="optimizer steps of each run (default: the base run's)")
     add("--seeds", type=whole(1), default=1, metavar="N", help="runs of each row (default: 1)")
     help = "runs at a time, a process each: a small model leaves most of a GPU idle (default: 1)"

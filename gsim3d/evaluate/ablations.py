@@ -35,6 +35,7 @@ from gsim3d.train.restore import model_config, restore
 from gsim3d.train.samples import check_scenes, context_cameras, spread_views
 
 PAPER = Path(gsim3d.__file__).parents[1] / "configs" / "ablations" / "paper.yaml"
+PRESET = "tiny"  # of the base run, unless another or a configuration is given
 METRICS = {"psnr_masked": "PSNR masked", "psnr": "PSNR", "psnr_body": "PSNR body"}
 METHODS = ("", "constant.", "copy.")
 TIE = 2.0  # standard errors within which a difference is a tie
@@ -115,9 +116,19 @@ def _changed(before: dict, change: dict, model: dict) -> dict:
 
 
 def base_run(
-    bases: dict[str, TrainConfig], preset: str, config: str | Path | None = None, n_steps: int | None = None
+    bases: dict[str, TrainConfig],
+    preset: str | None = None,
+    config: str | Path | None = None,
+    n_steps: int | None = None,
 ) -> TrainConfig:
-    """The run that rows change: of a file of ``gsim3d train``, or of a preset, in its steps or in ``n_steps``."""
+    """The run that rows change: of a file of ``gsim3d train``, or of a preset, in its steps or in ``n_steps``.
+
+    Raises:
+        InputError: the preset is unknown, or both are given.
+    """
+    if preset is not None and config is not None:
+        raise InputError("--preset: --config describes the base run; leave one of them out")
+    preset = preset or PRESET
     if config is None and preset not in bases:
         hint = did_you_mean(preset, bases)
         raise InputError(f"--preset: must be one of {', '.join(bases)}; got {preset!r}{hint}")

@@ -28,6 +28,7 @@ from gsim3d.train.samples import context_cameras, spread_views, subsampled
 
 LOG, BOARD = "metrics.jsonl", "tensorboard"
 MAX_LINE = 2**20  # bytes; what is longer is no entry
+MAX_LOG = 2**30  # bytes, of millions of steps
 VIDEO_MS = 80  # that a frame of a sample video is shown
 TRACES = "profile"  # folder
 SKIPPED, WARM_UP, TRACED = 1, 1, 2  # steps of a trace; the first one of a run is like no other
@@ -57,6 +58,8 @@ class Log:
             return
         if not self.file.is_file():
             raise InputError(f"{self.file}: cannot be read: it is not a file")
+        if (size := self.file.stat().st_size) > MAX_LOG:
+            raise InputError(f"{self.file}: has {size} bytes, a log has at most {MAX_LOG}; move it away")
         part = self.file.with_name(f".{self.file.name}.part")
         try:
             with open(self.file, "rb") as lines, open(part, "wb") as retained:

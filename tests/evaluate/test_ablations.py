@@ -109,6 +109,14 @@ def test_steps_are_shared_by_the_phases():
     assert base_run(BASES, "small", n_steps=300).n_steps == 300
 
 
+def test_base_run_takes_a_preset_or_a_configuration(tmp_path):
+    (tmp_path / "train.yaml").write_text("preset: tiny")
+    with pytest.raises(InputError, match="--preset: --config describes the base run"):
+        base_run(BASES, "tiny", tmp_path / "train.yaml")
+    assert base_run(BASES, None, tmp_path / "train.yaml").preset == "tiny"
+    assert base_run(BASES) == BASES["tiny"]
+
+
 def test_killed_study_goes_on_to_the_same_table(folders, tmp_path, monkeypatch):
     whole = run(study(folders, "latent,no-tem"), tmp_path / "whole")
     step, calls = Trainer.train_step, []

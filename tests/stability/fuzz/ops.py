@@ -264,7 +264,7 @@ def _call_residual_norm(a: Arguments):
     return ops.residual_norm(a["x"], a["branch"], keep=a["keep"], **pairs, eps=a["eps"])
 
 
-def _watch_rows(rng: random.Random) -> Arguments:
+def _validate_state(rng: random.Random) -> Arguments:
     n, clouds, dtype = _size(rng), rng.choice((0, 1, 2, 3)), _dtype(rng)
     n = n if clouds else 0
     shapes = (n, 3), (n,), (n, *rng.choice(((), (2,), (0,), (2, 3))))
@@ -285,15 +285,30 @@ def _watch_rows(rng: random.Random) -> Arguments:
     }
 
 
-def _call_watch_rows(a: Arguments):
+def _call_validate_state(a: Arguments):
     fields = [a[f"fields[{f}]"] for f in range(3)]
     previous = [a[f"previous[{f}]"] for f in range(3)] if "previous[0]" in a else None
     others = {name: value for name, value in a.items() if "[" not in name}
-    watched = ops.validate_state(fields, previous=previous, **others)
+    found = ops.validate_state(fields, previous=previous, **others)
     awake = a["activity"] != ASLEEP  # who sleeps is not looked at
-    if watched.fields is None or not all(bool(field.isfinite().all()) for field in previous or ()):
-        return watched.status, watched.record
-    return watched.status, watched.record, *(field[awake] for field in watched.fields)
+    if found.fields is None or not all(bool(field.isfinite().all()) for field in previous or ()):
+        return found.status, found.record
+    return found.status, found.record, *(field[awake] for field in found.fields)
+
+
+def _join_records(rng: random.Random) -> Arguments:
+    call = _validate_state(rng)
+    fields, others = (
+        [call[f"fields[{f}]"] for f in range(3)],
+        ("bounds", "cu_rows", "cloud_scene", "origin", "activity"),
+    )
+    record = ops.validate_state(fields, **{name: call[name] for name in others}, join=False).record
+    return {"parts": record.parts, "cu_rows": record.cu_rows, "n_rows": record.n_rows}
+
+
+def _call_join_records(a: Arguments):
+    shape = a["parts"].shape if isinstance(a["parts"], torch.Tensor) else ()
+    return ops.join_records([ops.PartialRecord(a["parts"], a["cu_rows"], a["n_rows"], shape, torch.float64, None)])
 
 
 def _norm_gelu(rng: random.Random) -> Arguments:
@@ -404,7 +419,8 @@ OPS: dict[str, tuple[Callable[[random.Random], Arguments], Callable[[Arguments],
     "unpool": (_unpool, lambda a: ops.unpool(**a)),
     "row_norm": (_row_norm, lambda a: ops.row_norm(**a)),
     "residual_norm": (_residual_norm, _call_residual_norm),
-    "validate_state": (_watch_rows, _call_watch_rows),
+    "validate_state": (_validate_state, _call_validate_state),
+    "join_records": (_join_records, _call_join_records),
     "norm_gelu": (_norm_gelu, lambda a: ops.norm_gelu(**a)),
     "decode_gaussians": (_decode, _call_decode),
     "plane_sweep": (_plane_sweep, lambda a: ops.plane_sweep(**a)),
