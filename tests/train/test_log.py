@@ -30,6 +30,14 @@ def test_log_cut_reads_endless_line_in_bounded_memory(tmp_path):
     assert (tmp_path / LOG).read_text() == '{"step": 1}\n'
 
 
+def test_log_beyond_a_gibibyte_is_refused_and_kept(tmp_path):
+    (tmp_path / LOG).write_text('{"step": 1}\n')
+    os.truncate(tmp_path / LOG, 2**30 + 1)
+    with pytest.raises(InputError, match=f"{LOG}: has 1073741825 bytes"):
+        Log(tmp_path).cut(4)
+    assert (tmp_path / LOG).stat().st_size == 2**30 + 1 and os.listdir(tmp_path) == [LOG]
+
+
 def test_log_that_is_no_file_is_refused(tmp_path):
     os.mkfifo(tmp_path / LOG)
     with pytest.raises(InputError, match=f"{LOG}: cannot be read: it is not a file"):
