@@ -21,6 +21,7 @@ COMMANDS = {
     "train": ("gsim3d.cli.train", "learn a simulator from a data set"),
     "simulate": ("gsim3d.cli.simulate", "predict the future of one scene: video and .ply"),
     "export": ("gsim3d.cli.export", "write 3D Gaussians for other tools: .spz, .splat, .glb, USD, a video"),
+    "view": ("gsim3d.cli.view", "look around in a prediction or a scene, in a browser"),
     "plan": ("gsim3d.cli.plan", "which effects of a scene are computed, and what that costs"),
     "effects": ("gsim3d.cli.effects", "find out which effects a scene needs"),
     "evaluate": ("gsim3d.cli.evaluate", "measure predictions on a data set, beside baselines and other models"),

@@ -13,6 +13,7 @@ OPTIONAL = {
     "mujoco-core": ("mujoco", "generate: physics", "pip install 'gsim3d[generate]'"),
     "embreex": ("embreex", "generate: ray tracing", "pip install 'gsim3d[generate]'"),
     "matplotlib": ("matplotlib", "plots of demo and evaluate", "pip install 'gsim3d[plot]'"),
+    "viser": ("viser", "gsim3d view", "pip install 'gsim3d[viewer]'"),
     "pytest": ("pytest", "the tests", "pip install 'gsim3d[dev]'"),
 }
 REQUIRED = ["torch", "numpy", "opencv-contrib-python-headless", "pyyaml", "safetensors", "tqdm", "trimesh"]

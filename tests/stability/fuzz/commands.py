@@ -34,6 +34,7 @@ RIGHT = {
     "train": "{good}/train.yaml --data {good}/data --out {out} --until 1",
     "simulate": "{good}/model.safetensors {good}/data/ball/0000 --out {out} --steps 1",
     "export": "{good}/a.ply --to {out}.splat",
+    "view": "{good}/a.ply",
     "plan": "{good}/data/ball/0000 {good}/model.safetensors",
     "effects": "infer {good}/data/ball/0000 {good}/model.safetensors --out {out}.yaml",
     "profile": "{good}/model.safetensors {good}/data --out {out} --quiet",

@@ -1,0 +1,368 @@
+"""What the live viewer shows: a target, the frame of a timeline, layers and colours. It knows no browser."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsim3d.data import Scene
+from gsim3d.errors import InputError, did_you_mean
+from gsim3d.io import write_splats
+from gsim3d.io.arrays import colors_of, dc_of, splats_of
+from gsim3d.io.files import new_output_path
+from gsim3d.math.rotations import rotation_matrices, rotation_to_quat
+from gsim3d.ops import rasterize_gaussians
+from gsim3d.state import ASLEEP, DYNAMIC, Gaussians, Particles
+
+COLORINGS = ("appearance", "velocity", "activity", "latents")
+AWAKE_COLOR, FROZEN_COLOR, ASLEEP_COLOR = (0.95, 0.5, 0.1), (0.55, 0.55, 0.55), (0.2, 0.45, 0.95)
+FASTEST = 0.99  # quantile of the speeds that has the last colour
+LATENT_RANGE = 0.02  # quantile of the latents that is black; as many are at full brightness
+KEPT_FRAMES = 128
+SPEEDS = (0.1, 4.0)  # of the timeline, relative to real time
+SIZES = (0.05, 1.0)  # of the drawn Gaussians, relative to their own
+
+
+class Timeline:
+    """Which frame is shown, and how time passes.
+
+    Attributes:
+        n_frames: how many there are.
+        fps: frames a second of real time.
+        speed: relative to real time.
+        playing: whether time passes.
+        loop: whether the first frame follows the last.
+    """
+
+    def __init__(self, n_frames: int, fps: float):
+        if n_frames < 1:
+            raise InputError(f"a timeline must have at least one frame; got {n_frames}")
+        if not 0 < fps < float("inf"):
+            raise InputError(f"fps must be a positive number; got {fps}")
+        self.n_frames, self.fps = n_frames, fps
+        self.speed, self.playing, self.loop, self._position = 1.0, False, True, 0.0
+
+    @property
+    def frame(self) -> int:
+        """Number of the frame that is shown, from 0."""
+        return min(int(self._position), self.n_frames - 1)
+
+    def play(self) -> None:
+        """Lets time pass; from the start where it stands at the end."""
+        if not self.loop and self.frame == self.n_frames - 1:
+            self._position = 0.0
+        self.playing = self.n_frames > 1
+
+    def pause(self) -> None:
+        """Stops time."""
+        self.playing = False
+
+    def seek(self, frame: int) -> None:
+        """Shows ``frame``. Raises InputError where there is no such frame."""
+        if not 0 <= frame < self.n_frames:
+            raise InputError(f"frame {frame}: there are {self.n_frames}, from 0")
+        self._position = float(frame)
+
+    def set_speed(self, speed: float) -> None:
+        """Sets the speed. Raises InputError outside of SPEEDS."""
+        if not SPEEDS[0] <= speed <= SPEEDS[1]:
+            raise InputError(f"speed must be from {SPEEDS[0]:g} to {SPEEDS[1]:g}; got {speed}")
+        self.speed = speed
+
+    def advance(self, seconds: float) -> bool:
+        """Lets ``seconds`` pass; whether another frame is shown now."""
+        if not self.playing:
+            return False
+        before, self._position = self.frame, self._position + seconds * self.fps * self.speed
+        if self._position >= self.n_frames:
+            self.playing = self.loop
+            self._position = self._position % self.n_frames if self.loop else self.n_frames - 1.0
+        return self.frame != before
+
+    def resize(self, n_frames: int) -> None:
+        """Changes the number of frames; the frame that is shown stays where it still exists."""
+        self._position, self.n_frames = float(min(self.frame, n_frames - 1)), n_frames
+
+
+@dataclass(frozen=True)
+class Layers:
+    """What is drawn.
+
+    Attributes:
+        moving: particles that may move.
+        frozen: particles of the static background.
+        cameras: cameras of the scene, with their images.
+        truth: true image beside the predicted one.
+        coloring: one of COLORINGS.
+        size: of the drawn Gaussians, relative to their own: small ones show single particles.
+    """
+
+    moving: bool = True
+    frozen: bool = True
+    cameras: bool = True
+    truth: bool = True
+    coloring: str = COLORINGS[0]
+    size: float = 1.0
+
+    def __post_init__(self):
+        if self.coloring not in COLORINGS:
+            known = ", ".join(COLORINGS)
+            raise InputError(
+                f"coloring must be one of {known}; got {self.coloring!r}{did_you_mean(self.coloring, COLORINGS)}"
+            )
+        if not SIZES[0] <= self.size <= SIZES[1]:
+            raise InputError(f"size must be from {SIZES[0]:g} to {SIZES[1]:g}; got {self.size}")
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera and what it recorded.
+
+    Attributes:
+        name: of the camera.
+        quat: [4] (w, x, y, z), from the camera's axes (x right, y down, z forward) to those of the scene.
+        position: [3] metres.
+        fov: vertical angle, radians.
+        aspect: width over height.
+        image: uint8 [H, W, 3]; None beyond the end of the recording.
+    """
+
+    name: str
+    quat: np.ndarray
+    position: np.ndarray
+    fov: float
+    aspect: float
+    image: np.ndarray | None
+
+
+class Target:
+    """Frames of Gaussians, with the particles that they are drawn from and the recorded scene where these are known.
+
+    Attributes:
+        name: shown as the title.
+        fps: frames a second.
+        particles: one cloud a frame; empty where only Gaussians are known.
+        scene: recorded scene; None: there is none.
+        first: step of the scene that frame 0 shows.
+        n_encoded: leading frames that come from images: their particles are not aligned from one to the next.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        fps: float,
+        *,
+        n_frames: int = 0,
+        read: Callable[[int], Gaussians] | None = None,
+        draw: Callable[[Particles], Gaussians] | None = None,
+        particles: Sequence[Particles] = (),
+        scene: Scene | None = None,
+        first: int = 0,
+        n_encoded: int = 0,
+    ):
+        """
+        Args:
+            n_frames: of ``read``.
+            read: Gaussians of a frame; None: they are drawn from ``particles``, or there are none.
+            draw: Gaussians of particles.
+        """
+        self.name, self.fps, self.scene, self.first, self.n_encoded = name, fps, scene, first, n_encoded
+        self._read, self._draw, self._n_read = read, draw, n_frames
+        self.replace(particles)
+
+    def replace(self, particles: Sequence[Particles]) -> None:
+        """Shows other particles from now on."""
+        self.particles = list(particles)
+        self.gaussians = functools.lru_cache(KEPT_FRAMES)(self._gaussians)
+        self._fastest: float | None = None
+        self._axes: tuple[Tensor, Tensor, Tensor] | None = None
+
+    def _gaussians(self, frame: int) -> Gaussians | None:
+        """Gaussians of a frame on the CPU; None where the target has none."""
+        if self.particles and self._draw is not None:
+            with torch.no_grad():
+                return self._draw(self.particles[frame]).to("cpu")
+        return None if self._read is None else self._read(frame)
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames: of particles, of files, or else of the recording."""
+        if self.particles or self._n_read:
+            return len(self.particles) or self._n_read
+        return 0 if self.scene is None else self.scene.n_steps - self.first
+
+    @property
+    def colorings(self) -> tuple[str, ...]:
+        """Those of COLORINGS that the target has values for."""
+        known = {"appearance": True, "velocity": self.n_frames > 1 and self.gaussians(0) is not None}
+        known |= {"activity": bool(self.particles), "latents": self._has_latents()}
+        return tuple(name for name in COLORINGS if known[name])
+
+    def _has_latents(self) -> bool:
+        return bool(self.particles) and self.particles[0].dynamic_latents.shape[1] > 0
+
+    def displacements(self, frame: int) -> Tensor:
+        """[N, 3] metres since the frame before; 0 where its particles are others."""
+        now = self.gaussians(frame)
+        before = self.gaussians(frame - 1) if frame > 0 and frame >= self.n_encoded else None
+        if before is None or len(before.means) != len(now.means):
+            return torch.zeros_like(now.means)
+        return now.means - before.means
+
+    def colors(self, frame: int, coloring: str) -> Tensor:
+        """[N, 3] in [0, 1], of the Gaussians of a frame; not of "appearance", which their harmonics hold.
+
+        Raises:
+            InputError: the target has no values for this colouring.
+        """
+        if coloring not in self.colorings[1:]:
+            raise InputError(f"{self.name} has no colours by {coloring}; it has {', '.join(self.colorings)}")
+        if coloring == "velocity":
+            return self._colors_of_velocity(frame)
+        return self._colors_of_activity(frame) if coloring == "activity" else self._colors_of_latents(frame)
+
+    def _colors_of_velocity(self, frame: int) -> Tensor:
+        if self._fastest is None:
+            some = np.unique(np.linspace(0, self.n_frames - 1, 12).round().astype(int))
+            speeds = [self.displacements(int(i)).norm(dim=1).numpy() for i in some]
+            moving = np.concatenate([speed[speed > 0] for speed in speeds])
+            self._fastest = float(np.quantile(moving, FASTEST)) if len(moving) else 1.0
+        speed = (self.displacements(frame).norm(dim=1) / self._fastest).clamp(0, 1)
+        table = cv2.applyColorMap((speed.numpy() * 255).round().astype(np.uint8)[:, None], cv2.COLORMAP_TURBO)
+        return torch.from_numpy(table[:, 0, ::-1].astype(np.float32) / 255)
+
+    def _colors_of_activity(self, frame: int) -> Tensor:
+        activity = self.particles[frame].activity.cpu()
+        colors = torch.tensor(FROZEN_COLOR).repeat(len(activity), 1)
+        colors[activity == DYNAMIC] = torch.tensor(AWAKE_COLOR)
+        asleep = activity == ASLEEP
+        if frame > 0 and frame >= self.n_encoded:  # a rollout leaves those asleep exactly where they were
+            same = len(self.particles[frame - 1].means) == len(activity)
+            asleep |= same & (activity == DYNAMIC) & (self.displacements(frame) == 0).all(1)
+        colors[asleep] = torch.tensor(ASLEEP_COLOR)
+        return colors
+
+    def _colors_of_latents(self, frame: int) -> Tensor:
+        if self._axes is None:
+            latents = self.particles[max(0, self.n_encoded - 1)].dynamic_latents.detach().cpu().float()
+            _, _, axes = torch.linalg.svd(latents - latents.mean(0), full_matrices=False)
+            axes = axes[:3]
+            sign = axes.gather(1, axes.abs().argmax(1, keepdim=True)).sign()
+            axes = torch.nn.functional.pad((axes * sign).T, (0, 3 - len(axes)))
+            values = (latents - latents.mean(0)) @ axes
+            low, high = (torch.quantile(values[:1_000_000], q, 0) for q in (LATENT_RANGE, 1 - LATENT_RANGE))
+            self._axes = axes, latents.mean(0) @ axes + low, (high - low).clamp(min=1e-9)
+        axes, low, span = self._axes
+        return ((self.particles[frame].dynamic_latents.detach().cpu().float() @ axes - low) / span).clamp(0, 1)
+
+    def seen(self, frame: int, layers: Layers) -> Gaussians | None:
+        """Gaussians of a frame as ``layers`` show them; None where the target has none."""
+        gaussians = self.gaussians(frame)
+        if gaussians is None:
+            return None
+        changes = {"scales": gaussians.scales * layers.size} if layers.size != 1 else {}
+        if layers.coloring != "appearance":
+            changes["sh"] = torch.from_numpy(dc_of(self.colors(frame, layers.coloring).numpy()))[:, None]
+        gaussians = dataclasses.replace(gaussians, **changes)
+        if not self.particles or layers.moving and layers.frozen:
+            return gaussians
+        moves = self.particles[frame].activity.cpu() != 1
+        chosen = moves if layers.moving else ~moves if layers.frozen else torch.zeros_like(moves)
+        fields = {name: getattr(gaussians, name)[chosen] for name in ("means", "quats", "scales", "opacities", "sh")}
+        return dataclasses.replace(gaussians, **fields, cu_rows=torch.tensor([0, int(chosen.sum())]))
+
+    def export(self, path: str | Path, frame: int, layers: Layers) -> Path:
+        """Writes what is seen of a frame in the format of the suffix of ``path``.
+
+        Raises:
+            InputError: there are no Gaussians, ``path`` exists, or its suffix is that of no format.
+        """
+        gaussians = self.seen(frame, layers)
+        if gaussians is None:
+            raise InputError(f"{self.name} holds no Gaussians that could be written to {path}")
+        out = new_output_path(path, "file")
+        write_splats(out, gaussians, fps=self.fps)
+        return out
+
+    def views(self, frame: int, cams: Sequence[int]) -> list[View]:
+        """Cameras ``cams`` of the scene at a frame."""
+        scene, step = self.scene, self.first + frame
+        assert scene is not None
+        cameras = scene.cameras_at(cams, [step])
+        images = self._truth(frame, cams)
+        found = []
+        for i, cam in enumerate(cams):
+            to_world = torch.linalg.inv(cameras.viewmats[i].double())
+            quat = rotation_to_quat(to_world[None, :3, :3])[0].numpy()
+            fov = 2 * np.arctan(cameras.height / 2 / float(cameras.Ks[i, 1, 1]))
+            aspect = cameras.width / cameras.height * float(cameras.Ks[i, 1, 1] / cameras.Ks[i, 0, 0])
+            image = None if images is None else images[i]
+            name = str(scene.camera_names[cam])
+            found.append(View(name, quat, to_world[:3, 3].numpy(), float(fov), aspect, image))
+        return found
+
+    def _truth(self, frame: int, cams: Sequence[int]) -> np.ndarray | None:
+        """uint8 [V, H, W, 3]; None beyond the end of the recording."""
+        step = self.first + frame
+        if self.scene is None or step >= self.scene.n_steps:
+            return None
+        return self.scene.images(list(cams), [step])[0].permute(0, 2, 3, 1).numpy()
+
+    def beside(self, frame: int, cam: int, layers: Layers) -> np.ndarray | None:
+        """uint8 [H, W or 2 W, 3]: the true image of a camera, and beside it what this camera would see.
+
+        Returns:
+            None without a recorded scene; where there are no Gaussians the true image alone; black for what lies
+            beyond the end of the recording.
+        """
+        if self.scene is None:
+            return None
+        truth, gaussians = self._truth(frame, [cam]), self.seen(frame, layers)
+        shape = (self.scene.height, self.scene.width, 3)
+        images = [np.zeros(shape, np.uint8) if truth is None else truth[0]]
+        if gaussians is not None:
+            camera = self.scene.cameras_at([cam], [self.first + frame])
+            fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
+            with torch.no_grad():
+                color = rasterize_gaussians(*fields, camera, sh=gaussians.sh, on_invalid="drop").color[0]
+            images.append((color.clamp(0, 1) * 255).round().byte().numpy())
+        return np.concatenate(images, 1)
+
+
+@dataclass(frozen=True)
+class Splatting:
+    """Gaussians as arrays that a browser draws, float32.
+
+    Attributes:
+        centers: [N, 3].
+        covariances: [N, 3, 3].
+        rgbs: [N, 3] in [0, 1], without view dependence.
+        opacities: [N, 1] in [0, 1].
+    """
+
+    centers: np.ndarray
+    covariances: np.ndarray
+    rgbs: np.ndarray
+    opacities: np.ndarray
+
+
+def splatting_of(gaussians: Gaussians, unit: float) -> Splatting:
+    """``gaussians`` in units of ``unit`` metres, with standard deviations that a half-precision covariance holds."""
+    splats = splats_of(gaussians, None, Path("viewer"))
+    rotations = rotation_matrices(torch.from_numpy(splats.quats)).numpy()
+    scaled = rotations * np.clip(splats.scales / unit, 3e-4, 200.0)[:, None]
+    rgbs = np.clip(colors_of(splats), 0, 1).astype(np.float32)
+    return Splatting(splats.means / unit, scaled @ scaled.transpose(0, 2, 1), rgbs, splats.opacities[:, None])
+
+
+def unit_of(gaussians: Gaussians) -> float:
+    """Metres that standard deviations are best counted in: in it their median is in the middle of what is held."""
+    return 4 * float(gaussians.scales.median()) if len(gaussians.scales) and gaussians.scales.median() > 0 else 1.0

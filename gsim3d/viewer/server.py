@@ -1,0 +1,295 @@
+"""The live viewer in a browser, served by viser: controls, and what :mod:`gsim3d.viewer.live` says is to be drawn."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import socket
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from gsim3d.errors import InputError
+from gsim3d.viewer.live import SIZES, SPEEDS, Layers, Target, Timeline, splatting_of, unit_of
+from gsim3d.viewer.targets import OPERATIONS, Simulation
+
+LOCAL, PUBLIC = "127.0.0.1", "0.0.0.0"
+MOST_CAMERAS = 16  # of a scene that are drawn, spread evenly
+TICK = 1 / 60  # seconds between looks at the clock
+LAYER_HINTS = {
+    "moving": "particles that may move",
+    "frozen": "particles of the static background",
+    "cameras": "cameras of the scene with their images",
+    "truth": "true image beside what its camera would see",
+}
+
+
+def load_viser() -> Any:
+    """The module viser. Raises InputError where it is not installed."""
+    try:
+        import viser
+    except ImportError:
+        raise InputError("gsim3d view needs the package viser: pip install 'gsim3d[viewer]'") from None
+    return viser
+
+
+def free_port(host: str, port: int = 0) -> int:
+    """A port of ``host`` that is free: ``port``, or any where it is 0. Raises InputError where it is taken."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            raise InputError(f"--port {port}: {error.strerror}; leave it out to take a free one") from None
+        return probe.getsockname()[1]
+
+
+class Viewer:
+    """A server that shows a target until it is closed. Use as a context.
+
+    Attributes:
+        timeline: which frame is shown.
+        layers: what of it is drawn.
+        address: for a browser.
+    """
+
+    def __init__(
+        self, target: Target, simulation: Simulation | None = None, *, host: str = LOCAL, port: int = 0
+    ) -> None:
+        """
+        Args:
+            target: what is shown.
+            simulation: that made it, to simulate on; None: the target cannot be changed.
+            host: address that the server listens at.
+            port: 0: a free one.
+        Raises:
+            InputError: viser is not installed, the target is empty, or the port is taken.
+        """
+        viser = load_viser()
+        self._target, self._simulation, self._lock = target, simulation, threading.RLock()
+        self.timeline, self.layers = Timeline(target.n_frames, target.fps), Layers()
+        scene = target.scene
+        n_cams = 0 if scene is None else scene.n_cams
+        self._cams = sorted({i * n_cams // MOST_CAMERAS for i in range(MOST_CAMERAS)}) if n_cams else []
+        first = target.gaussians(0)
+        self._unit = 1.0 if first is None else unit_of(first)
+        self._splats, self._frusta, self._closed = None, {}, threading.Event()
+        with contextlib.redirect_stdout(io.StringIO()):  # its banner
+            self._server = viser.ViserServer(host, free_port(host, port), label=f"gsim3d: {target.name}", verbose=False)
+        self.address = f"http://{LOCAL if host == PUBLIC else host}:{self._server.get_port()}"
+        self._look_at_target()
+        self._add_controls()
+        self._draw()
+        self._clock = threading.Thread(target=self._run, daemon=True)
+        self._clock.start()
+
+    def __enter__(self) -> Viewer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stops the server; its port is free again."""
+        self._closed.set()
+        self._clock.join()
+        with self._lock, contextlib.redirect_stdout(io.StringIO()):
+            self._server.stop()
+
+    def wait(self) -> None:
+        """Returns when the viewer is closed, for example by another thread."""
+        while not self._closed.wait(1):
+            pass
+
+    def _run(self) -> None:
+        before = time.monotonic()
+        while not self._closed.wait(TICK):
+            with self._lock:
+                now = time.monotonic()
+                if self.timeline.advance(now - before):
+                    self._draw()
+                    now = time.monotonic() if not self.timeline.playing else now
+                before = now
+
+    def _look_at_target(self) -> None:
+        """Where a browser begins: above and behind the first camera, or all Gaussians from the side."""
+        camera, scene = self._server.initial_camera, self._server.scene
+        scene.set_up_direction("+z")
+        gaussians = self._target.gaussians(0)
+        if self._cams:
+            view = self._target.views(0, self._cams[:1])[0]
+            cameras = self._target.scene.cameras_at(self._cams[:1], [self._target.first])
+            forward, depth = cameras.viewmats[0, 2, :3].double().numpy(), float(cameras.near[0] + cameras.far[0]) / 2
+            camera.position = view.position + depth * (np.array([0.0, 0.0, 0.4]) - 0.5 * forward)
+            camera.look_at, self._frustum_size = view.position + depth * forward, 0.06 * depth
+        elif gaussians is not None and len(gaussians.means):
+            means = gaussians.means.double().numpy()
+            middle = np.median(means, 0)
+            ends = np.linalg.norm(means - middle, axis=1) + 3 * gaussians.scales.max(1).values.numpy()
+            reach = max(float(np.quantile(ends, 0.95)), 1e-3)
+            camera.position, camera.look_at = middle + reach * np.array([1.8, 1.0, 0.9]), middle
+
+    # Controls. A callback runs in a thread of viser's; the lock lets one of them at a time change what is drawn.
+
+    def _add_controls(self) -> None:
+        gui, target, n = self._server.gui, self._target, self.timeline.n_frames
+        with gui.add_folder("Time"):
+            self._play = gui.add_button("Play", disabled=n < 2)
+            self._frame = gui.add_slider("Frame", 0, max(n - 1, 1), 1, 0, disabled=n < 2)
+            speed = gui.add_slider("Speed", *SPEEDS, 0.1, 1.0)
+            loop = gui.add_checkbox("Loop", True)
+            self._status = gui.add_markdown("")
+        self._on(self._play, self._toggle, "on_click")
+        self._on(self._frame, lambda: self._seek(int(self._frame.value)))
+        self._on(speed, lambda: self.timeline.set_speed(speed.value))
+        self._on(loop, lambda: setattr(self.timeline, "loop", loop.value))
+        with gui.add_folder("Layers"):
+            shown = ["moving", "frozen"] if target.particles else []
+            for name in shown + (["cameras", "truth"] if self._cams else []):
+                box = gui.add_checkbox(name, True, hint=LAYER_HINTS[name])
+                self._on(box, partial(self._change_layer, name, box))
+            if target.gaussians(0) is not None:
+                coloring = gui.add_dropdown("Colours", target.colorings)
+                size = gui.add_slider("Size", *SIZES, 0.05, 1.0, hint="of the drawn Gaussians")
+                self._on(coloring, partial(self._change_layer, "coloring", coloring))
+                self._on(size, partial(self._change_layer, "size", size))
+        self._beside = self._camera = None
+        if self._cams:
+            names = [f"{cam}: {target.scene.camera_names[cam]}" for cam in range(target.scene.n_cams)]
+            with gui.add_folder("Truth | prediction" if target.gaussians(0) is not None else "Recorded"):
+                self._camera = gui.add_dropdown("Camera", names)
+                self._beside = gui.add_image(np.zeros((16, 16, 3), np.uint8), format="png")
+            self._on(self._camera, self._draw)
+        if target.gaussians(0) is not None:
+            with gui.add_folder("Export", expand_by_default=False):
+                path = gui.add_text("File", "seen.ply", hint="on the machine of the server; must not exist yet")
+                write = gui.add_button("Write what is seen")
+            self._on(write, lambda: self._export(path.value), "on_click")
+        if self._simulation is not None:
+            self._add_edits()
+
+    def _add_edits(self) -> None:
+        gui, means = self._server.gui, self._target.gaussians(0).means
+        middle = tuple(float(x) for x in means.median(0).values)
+        with gui.add_folder("Simulate on"):
+            chosen = gui.add_dropdown("Edit", ("none", *OPERATIONS))
+            which = gui.add_dropdown("Particles", ("moving", "frozen", "all"))
+            inside = gui.add_checkbox("Inside of the box", False)
+            centre, size = gui.add_vector3("Middle", middle, step=0.01), gui.add_vector3("Sides", (0.5,) * 3, step=0.01)
+            vector = gui.add_vector3("Vector", (0.0, 0.0, 0.1), step=0.01, hint="metres, metres a step, or a colour")
+            n_steps = gui.add_number("Steps", 12, min=1, max=1000, step=1)
+            button = gui.add_button("Simulate on from this frame")
+        box = self._server.scene.add_box("/box", (255, 160, 0), size.value, wireframe=True, visible=False)
+
+        def place() -> None:
+            box.position, box.dimensions, box.visible = centre.value, size.value, inside.value
+
+        def simulate() -> None:
+            corners = None
+            if inside.value:
+                middle, half = np.array(centre.value), np.abs(size.value) / 2
+                corners = middle - half, middle + half
+            made = []
+            if chosen.value != "none":
+                made = [self._simulation.operation(chosen.value, which.value, vector.value, corners)]
+            self.simulate_on(int(n_steps.value), made)
+
+        for handle in (inside, centre, size):
+            self._on(handle, place)
+        self._on(button, simulate, "on_click")
+
+    def simulate_on(self, n_steps: int, operations: list) -> None:
+        """Predicts the frames after the one that is shown anew, as :meth:`Simulation.simulate_on` does."""
+        with self._lock:
+            self.timeline.pause()
+            self._simulation.simulate_on(self.timeline.frame, n_steps, operations)
+            self.timeline.resize(self._target.n_frames)
+            self._frame.max = self.timeline.n_frames - 1
+            self._draw()
+
+    def _on(self, handle: Any, act: Callable[[], Any], event: str = "on_update") -> None:
+        """Calls ``act`` when a user changes ``handle``; an InputError of it is shown in the browser."""
+
+        def call(change: Any) -> None:
+            if change.client is None:  # changed by this class
+                return
+            with self._lock:
+                if self._closed.is_set():
+                    return
+                try:
+                    act()
+                except InputError as error:
+                    change.client.add_notification("Not possible", str(error), color="red")
+
+        getattr(handle, event)(call)
+
+    def _toggle(self) -> None:
+        (self.timeline.pause if self.timeline.playing else self.timeline.play)()
+        self._draw()
+
+    def _seek(self, frame: int) -> None:
+        self.timeline.pause()
+        self.timeline.seek(frame)
+        self._draw()
+
+    def _change_layer(self, name: str, handle: Any) -> None:
+        self.layers = dataclasses.replace(self.layers, **{name: handle.value})
+        self._draw()
+
+    def _export(self, path: str) -> None:
+        out = self._target.export(path, self.timeline.frame, self.layers)
+        self._status.content = f"Written: `{out}`"
+
+    # Drawing
+
+    def _draw(self) -> None:
+        """Sends the frame that is shown, all of it at one time."""
+        with self._lock:
+            frame = self.timeline.frame
+            seen = self._target.seen(frame, self.layers)
+            with self._server.atomic():
+                if seen is not None:
+                    self._draw_splats(splatting_of(seen, self._unit))
+                self._draw_cameras(frame)
+                if self._beside is not None:
+                    self._beside.visible = self.layers.truth
+                    if self.layers.truth:
+                        cam = int(self._camera.value.partition(":")[0])
+                        self._beside.image = self._target.beside(frame, cam, self.layers)
+                self._frame.value = frame
+                self._play.label = "Pause" if self.timeline.playing else "Play"
+                self._status.content = self._description(frame, 0 if seen is None else len(seen.means))
+
+    def _description(self, frame: int, count: int) -> str:
+        given = " (input)" if frame < self._target.n_encoded else ""
+        text = f"{frame / self.timeline.fps:.2f} s, frame {frame} of {self.timeline.n_frames}{given}"
+        text += f", {count:,} Gaussians" if count else ""
+        if self._simulation is not None:
+            text += f", {1000 * self._simulation.seconds_a_step:.0f} ms a simulated step"
+        return text
+
+    def _draw_splats(self, arrays: Any) -> None:
+        values = (arrays.centers, arrays.covariances, arrays.rgbs, arrays.opacities)
+        if self._splats is None:
+            self._splats = self._server.scene.add_gaussian_splats("/gaussians", *values, scale=self._unit)
+        else:
+            self._splats.set_gaussians(*values)
+
+    def _draw_cameras(self, frame: int) -> None:
+        if not self._cams:
+            return
+        if self.layers.cameras:
+            for cam, view in zip(self._cams, self._target.views(frame, self._cams), strict=True):
+                if cam not in self._frusta:
+                    size = {"scale": self._frustum_size, "thickness": 0.04 * self._frustum_size}
+                    add = self._server.scene.add_camera_frustum
+                    self._frusta[cam] = add(f"/cameras/{cam}", view.fov, view.aspect, **size, format="jpeg")
+                frustum = self._frusta[cam]
+                frustum.wxyz, frustum.position, frustum.image = view.quat, view.position, view.image
+        for frustum in self._frusta.values():
+            frustum.visible = self.layers.cameras

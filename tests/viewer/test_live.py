@@ -1,0 +1,353 @@
+"""The live viewer: timeline, layers, colours, targets and edits without a browser; its server; Chromium."""
+
+import dataclasses
+import subprocess
+import sys
+import time
+import urllib.request
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from gsim3d.cameras import InputSpec
+from gsim3d.cli.main import main
+from gsim3d.effects.edits import Move, Remove
+from gsim3d.effects.spec import DynamicsEffects, EffectsSpec
+from gsim3d.errors import InputError
+from gsim3d.io import read_splats, write_ply
+from gsim3d.io.sequence import write_about
+from gsim3d.math.spherical_harmonics import SH_0
+from gsim3d.state import ASLEEP, DYNAMIC, FROZEN, Gaussians
+from gsim3d.viewer import server
+from gsim3d.viewer.live import (
+    ASLEEP_COLOR,
+    AWAKE_COLOR,
+    FROZEN_COLOR,
+    Layers,
+    Target,
+    Timeline,
+    splatting_of,
+    unit_of,
+)
+from gsim3d.viewer.targets import Simulation, open_simulation, open_target
+from tests.test_simulator import SIZE, make_simulator
+from tests.tiny_scenes import N_CAMS, write_scene
+from tests.viewer.browser import Browser, chromium
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+RED = (0.9, 0.1, 0.1)
+
+
+def splats(means, color=RED) -> Gaussians:
+    means = torch.tensor(means, dtype=torch.float32)
+    n = len(means)
+    sh = ((torch.tensor(color) - 0.5) / SH_0).expand(n, 1, 3)
+    quats = torch.tensor([[1.0, 0, 0, 0]]).expand(n, 4)
+    return Gaussians(means, quats, torch.full((n, 3), 0.1), torch.full((n,), 0.99), sh, torch.tensor([0, n]))
+
+
+def falling(n_frames=4):
+    return [splats([[0.0, 0.0, -0.1 * step], [1.0, 0.0, 0.0]]) for step in range(n_frames)]
+
+
+def target_of(frames, **options) -> Target:
+    return Target("falling", 10.0, n_frames=len(frames), read=frames.__getitem__, **options)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_scene(tmp_path_factory.mktemp("data") / "ball" / "0000", size=SIZE)
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    simulator = make_simulator()
+    simulator.inputs = InputSpec(history=2, context_views=2, image_size=(SIZE, SIZE), fps=12.0)
+    simulator.effects = EffectsSpec(dynamics=DynamicsEffects(history=2))
+    return simulator.save_pretrained(tmp_path_factory.mktemp("model") / "model")
+
+
+@pytest.fixture
+def simulation(checkpoint, scene) -> Simulation:
+    return open_simulation(checkpoint, scene, n_steps=3)
+
+
+def test_timeline_advances_at_its_speed_and_loops():
+    timeline = Timeline(10, fps=20)
+    assert not timeline.advance(1.0) and timeline.frame == 0
+    timeline.play()
+    assert timeline.advance(0.11) and timeline.frame == 2
+    assert not timeline.advance(0.01)
+    timeline.set_speed(0.5)
+    timeline.advance(0.2)
+    assert timeline.frame == 4
+    timeline.advance(0.6)
+    assert timeline.frame == 0 and timeline.playing
+
+
+def test_timeline_stops_at_the_end_without_loop_and_starts_again():
+    timeline = Timeline(4, fps=10)
+    timeline.loop = False
+    timeline.play()
+    timeline.advance(9.0)
+    assert timeline.frame == 3 and not timeline.playing
+    timeline.play()
+    assert timeline.frame == 0 and timeline.playing
+    timeline.pause()
+    assert not timeline.advance(1.0)
+
+
+def test_timeline_resize_keeps_the_frame_where_it_exists():
+    timeline = Timeline(10, fps=10)
+    timeline.seek(7)
+    timeline.resize(9)
+    assert timeline.frame == 7
+    timeline.resize(3)
+    assert timeline.frame == 2
+
+
+@pytest.mark.parametrize(
+    "wrong, message",
+    [
+        (lambda: Timeline(0, 10), "at least one frame"),
+        (lambda: Timeline(3, float("nan")), "fps"),
+        (lambda: Timeline(3, 10).seek(3), "frame 3: there are 3"),
+        (lambda: Timeline(3, 10).set_speed(0.0), "speed must be from"),
+        (lambda: Layers(coloring="velocit"), "did you mean velocity"),
+        (lambda: Layers(size=0.0), "size must be from"),
+        (lambda: target_of(falling()).seen(0, Layers(coloring="latents")), "no colours by latents"),
+    ],
+)
+def test_wrong_values_are_named(wrong, message):
+    with pytest.raises(InputError, match=message):
+        wrong()
+
+
+def test_velocity_colors_what_moved():
+    target = target_of(falling())
+    assert target.colorings == ("appearance", "velocity")
+    colors = target.colors(2, "velocity")
+    assert not torch.equal(colors[0], colors[1])
+    assert torch.equal(target.colors(0, "velocity")[0], colors[1])
+    assert target.displacements(3)[0].tolist() == pytest.approx([0, 0, -0.1])
+
+
+def test_frames_with_other_particles_have_no_velocity():
+    frames = falling()
+    frames[2] = splats([[5.0, 0.0, 0.0]])
+    assert target_of(frames).displacements(2).abs().max() == 0
+    assert target_of(falling(), n_encoded=3).displacements(2).abs().max() == 0
+
+
+def test_single_frame_has_appearance_alone():
+    assert target_of(falling(1)).colorings == ("appearance",)
+
+
+def test_size_and_coloring_change_what_is_seen_and_exported(tmp_path):
+    target = target_of(falling())
+    layers = Layers(coloring="velocity", size=0.5)
+    out = target.export(tmp_path / "seen.ply", 2, layers)
+    written = read_splats(out)
+    torch.testing.assert_close(written.scales, torch.full((2, 3), 0.05))
+    torch.testing.assert_close(0.5 + SH_0 * written.sh[:, 0], target.colors(2, "velocity"))
+    with pytest.raises(InputError, match="exists already"):
+        target.export(out, 2, layers)
+    with pytest.raises(InputError, match="no format"):
+        target.export(tmp_path / "seen.txt", 2, layers)
+
+
+@pytest.mark.parametrize("scale", [1e-4, 0.01, 30.0])
+def test_splatting_has_covariances_that_half_precision_holds(scale):
+    gaussians = dataclasses.replace(splats([[1.0, 2.0, 3.0]]), scales=torch.tensor([[1.0, 2.0, 3.0]]) * scale)
+    unit = unit_of(gaussians)
+    arrays = splatting_of(gaussians, unit)
+    expected = np.diag([1.0, 4.0, 9.0]) * scale**2
+    held = arrays.covariances[0].astype(np.float16).astype(np.float64)
+    np.testing.assert_allclose(held * unit**2, expected, rtol=1e-3)
+    np.testing.assert_allclose(arrays.centers[0] * unit, [1, 2, 3], rtol=1e-6)
+    np.testing.assert_allclose(arrays.rgbs[0], RED, rtol=1e-5)
+
+
+def test_scene_shows_its_cameras_and_images(scene):
+    target = open_target(scene, start=1)
+    assert target.n_frames == 5 and target.gaussians(0) is None and target.colorings == ("appearance",)
+    views = target.views(0, range(N_CAMS))
+    assert [view.image.shape for view in views] == [(SIZE, SIZE, 3)] * N_CAMS
+    assert np.linalg.norm(views[0].position[:2]) == pytest.approx(2.5)
+    assert views[0].fov == pytest.approx(2 * np.arctan(0.5 / 1.3))
+    assert target.beside(0, 0, Layers()).shape == (SIZE, SIZE, 3)
+    with pytest.raises(InputError, match="holds no Gaussians"):
+        target.export("a.ply", 0, Layers())
+
+
+@pytest.fixture
+def run(tmp_path):
+    folder = tmp_path / "run" / "gaussians"
+    folder.mkdir(parents=True)
+    for step, frame in enumerate(falling()):
+        write_ply(folder / f"step_{step:04d}.ply", frame)
+    write_about(folder, 42.0)
+    return tmp_path / "run"
+
+
+def test_run_is_opened_with_its_rate_and_the_truth_beside_it(run, scene):
+    target = open_target(run)
+    assert (target.n_frames, target.fps, target.scene) == (4, 42.0, None)
+    assert (
+        open_target(run / "gaussians").n_frames == 4 and open_target(run / "gaussians" / "step_0001.ply").n_frames == 1
+    )
+    target = open_target(run, scene=scene, start=4)
+    pair = target.beside(1, 0, Layers())
+    assert pair.shape == (SIZE, 2 * SIZE, 3) and pair[:, :SIZE].any() and pair[:, SIZE:].any()
+    assert not target.beside(2, 0, Layers())[:, :SIZE].any()
+    assert target.views(3, [0])[0].image is None
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"target": "none"}, "no such file or folder"),
+        ({"target": "run", "start": 2}, "without --scene"),
+        ({"target": "run", "scene": "scene", "start": 6}, "--start 6: .* 6 steps"),
+        ({"target": "scene", "up": "y"}, "--scene and --up belong"),
+        ({"target": "."}, "no file of Gaussians"),
+    ],
+)
+def test_open_target_names_what_is_wrong(options, message, run, scene, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    options = {key: {"run": run, "scene": scene}.get(value, value) for key, value in options.items()}
+    with pytest.raises(InputError, match=message):
+        open_target(**options)
+
+
+def test_simulation_has_encoded_and_predicted_frames(simulation):
+    target = simulation.target
+    assert (target.n_frames, target.n_encoded) == (5, 2) and simulation.seconds_a_step > 0
+    assert target.colorings == ("appearance", "velocity", "activity", "latents")
+    for frame in (0, 4):
+        for coloring in target.colorings[1:]:
+            colors = target.colors(frame, coloring)
+            assert colors.shape == target.gaussians(frame).means.shape and 0 <= colors.min() <= colors.max() <= 1
+
+
+def test_activity_colors_and_layers_follow_the_particles(simulation):
+    target = simulation.target
+    particles = target.particles[1]
+    activity = torch.full_like(particles.activity, DYNAMIC)
+    activity[:2], activity[2] = FROZEN, ASLEEP
+    target.replace([dataclasses.replace(particles, activity=activity)])
+    colors = target.colors(0, "activity")
+    for row, color in ((0, FROZEN_COLOR), (2, ASLEEP_COLOR), (3, AWAKE_COLOR)):
+        assert colors[row].tolist() == pytest.approx(color)
+    count = len(activity)
+    seen = [target.seen(0, Layers(moving=moving, frozen=not moving)) for moving in (True, False)]
+    assert [len(one.means) for one in seen] == [count - 2, 2]
+    assert len(target.seen(0, Layers(moving=False, frozen=False)).means) == 0
+
+
+def test_simulate_on_equals_one_rollout_with_all_edits(simulation, checkpoint, scene):
+    first = simulation.target.particles[2].means
+    simulation.simulate_on(2, 2, [Move("all", (0.0, 0.0, 0.5))])
+    simulation.simulate_on(3, 2, [Move("all", (0.0, 0.2, 0.0))])
+    target = simulation.target
+    assert target.n_frames == 6 and [edit.step for edit in simulation.edits] == [1, 2]
+    assert torch.equal(target.particles[2].means, first)
+    assert (target.particles[3].means - first)[:, 2].mean() > 0.3
+    again = open_simulation(checkpoint, scene, n_steps=1)
+    state, plan = again._state, again._simulator.plan(again._spec)
+    with torch.no_grad():
+        steps = again._simulator.rollout(state, 4, plan, edits=simulation.edits)
+    assert torch.equal(target.particles[-1].means, steps[-1].means)
+    simulation.simulate_on(1, 1)
+    assert simulation.edits == () and target.n_frames == 3
+
+
+def test_simulate_on_removes_inside_of_a_box_and_refuses_without_a_change(simulation):
+    target, before = simulation.target, list(simulation.target.particles)
+    with pytest.raises(InputError, match="edit at step 2, remove: the selection is empty"):
+        simulation.simulate_on(3, 1, [simulation.operation("remove", "all", (0, 0, 0), ([90] * 3, [91] * 3))])
+    with pytest.raises(InputError, match="frame 0 must be from 1 to 4"):
+        simulation.simulate_on(0, 1)
+    with pytest.raises(InputError, match="operation must be one of"):
+        simulation.operation("explode", "all", (0, 0, 0))
+    assert all(a is b for a, b in zip(target.particles, before, strict=True)) and simulation.edits == ()
+    middle = target.particles[3].means.median(0).values.tolist()
+    box = [x - 0.3 for x in middle], [x + 0.3 for x in middle]
+    simulation.simulate_on(3, 1, [simulation.operation("remove", "all", (0, 0, 0), box)])
+    assert isinstance(simulation.edits[0].operation, Remove)
+    assert 0 < target.particles[-1].n_rows < target.particles[3].n_rows
+
+
+def test_viewer_is_not_imported_before_it_is_asked_for():
+    code = "import gsim3d, gsim3d.viewer, gsim3d.viewer.server, sys; assert 'viser' not in sys.modules"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_missing_viser_says_how_to_install_it(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert main(["view", "a.ply"]) == 2
+    assert "pip install 'gsim3d[viewer]'" in capsys.readouterr().err
+
+
+@pytest.fixture
+def viser():
+    return pytest.importorskip("viser", reason="needs viser")
+
+
+def test_server_answers_on_a_free_port_and_gives_it_back(viser):
+    with server.Viewer(target_of(falling())) as viewer:
+        assert viewer.address.startswith("http://127.0.0.1:")
+        with urllib.request.urlopen(viewer.address) as answer:
+            assert answer.status == 200 and b"<html" in answer.read().lower()
+        port = int(viewer.address.rpartition(":")[2])
+        with pytest.raises(InputError, match=f"--port {port}"):
+            server.free_port("127.0.0.1", port)
+        viewer.timeline.play()
+        end = time.monotonic() + 10
+        while viewer.timeline.frame == 0 and time.monotonic() < end:
+            time.sleep(0.02)
+        assert viewer.timeline.frame > 0
+    assert server.free_port("127.0.0.1", port) == port
+
+
+def test_viewer_simulates_on_from_the_frame_that_is_shown(viser, simulation):
+    with server.Viewer(simulation.target, simulation) as viewer:
+        viewer.timeline.seek(2)
+        viewer.simulate_on(6, [Move("all", (0.0, 0.0, 0.1))])
+        assert viewer.timeline.n_frames == 9 and viewer.timeline.frame == 2
+
+
+def test_view_command_prints_the_address_and_ends_with_ctrl_c(viser, run, scene, checkpoint, monkeypatch, capsys):
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(server.Viewer, "wait", interrupt)
+    assert main(["view", str(run), "--scene", str(scene)]) == 0
+    out, err = capsys.readouterr()
+    assert "run: 4 frames at http://127.0.0.1:" in out and "viser" not in out and not err
+    assert main(["view", str(scene), "--checkpoint", str(checkpoint), "--steps", "2"]) == 0
+    assert "4 frames" in capsys.readouterr().out
+    for wrong in (["--steps", "2"], ["--checkpoint", str(checkpoint), "--fps", "3"]):
+        assert main(["view", str(scene), *wrong]) == 2
+
+
+@pytest.mark.skipif(chromium() is None, reason="needs Chromium")
+def test_browser_shows_the_gaussians(viser):
+    """A part of the page has their colour, and no request leaves the machine."""
+    means = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3)).tolist()
+    with server.Viewer(target_of([splats(means)])) as viewer, Browser(1000, 600) as browser:
+        browser.open(viewer.address)
+
+        def share_of_red(enough: float) -> float:
+            end, share = time.monotonic() + 60, 0.0
+            while share < enough and time.monotonic() < end:
+                time.sleep(0.3)
+                shot = cv2.imdecode(np.frombuffer(browser.screenshot(), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+                share = float((np.abs(shot / 255 - RED) < 0.1).all(-1).mean())
+            return share
+
+        assert 0.02 < share_of_red(0.02) < 0.9
+        local = ("data:", "blob:", viewer.address)
+        assert not [url for url in browser.requests if not url.startswith(local)]
