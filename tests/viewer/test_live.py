@@ -335,9 +335,9 @@ def test_view_command_prints_the_address_and_ends_with_ctrl_c(viser, run, scene,
 
 @pytest.mark.skipif(chromium() is None, reason="needs Chromium")
 def test_browser_shows_the_gaussians(viser):
-    """A part of the page has their colour, and no request leaves the machine."""
-    means = np.random.default_rng(0).uniform(-0.5, 0.5, (200, 3)).tolist()
-    with server.Viewer(target_of([splats(means)])) as viewer, Browser(1000, 600) as browser:
+    """A part of the page has their colour, its buttons work, and no request leaves the machine."""
+    frames = [splats(np.random.default_rng(seed).uniform(-0.5, 0.5, (200, 3)).tolist()) for seed in range(3)]
+    with server.Viewer(target_of(frames)) as viewer, Browser(1000, 600) as browser:
         browser.open(viewer.address)
 
         def share_of_red(enough: float) -> float:
@@ -349,5 +349,11 @@ def test_browser_shows_the_gaussians(viser):
             return share
 
         assert 0.02 < share_of_red(0.02) < 0.9
+        find = "[...document.querySelectorAll('button')].find(button => button.textContent === 'Play')"
+        browser.value(f"{find}.click()")
+        end = time.monotonic() + 20
+        while viewer.timeline.frame == 0 and time.monotonic() < end:
+            time.sleep(0.02)
+        assert viewer.timeline.playing and viewer.timeline.frame > 0
         local = ("data:", "blob:", viewer.address)
         assert not [url for url in browser.requests if not url.startswith(local)]
