@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from gsim3d.cli.arguments import number, whole
-from gsim3d.pretrained import CHECKPOINT_HELP, add_fitting
+from gsim3d.cli.arguments import add_fitting, number, whole
+from gsim3d.pretrained import CHECKPOINT_HELP
 
 EPILOG = """\
 Serves the viewer on this machine, prints its address and runs until Ctrl-C. It needs pip install 'gsim3d[viewer]'.
@@ -33,13 +33,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--fps", type=number(0, 1e6, above=True), help="frames a second (default: TARGET's, else 24)")
     add("--up", choices=("y", "z"), help="axis that points up in files of Gaussians (default: as their format says)")
     add("--port", type=whole(0, 65535), default=0, help="of the address (default: a free one)")
-    add("--public", action="store_true", help="let other machines connect, who may then write files here")
+    add("--public", action="store_true", help="let other machines connect: they can write files here")
 
 
 def run(args: argparse.Namespace) -> int:
     from gsim3d.errors import InputError
+    from gsim3d.train.restore import restore
     from gsim3d.viewer.server import LOCAL, PUBLIC, Viewer, load_viser
-    from gsim3d.viewer.targets import open_simulation, open_target
+    from gsim3d.viewer.targets import Simulation, open_target
 
     load_viser()
     simulation = None
@@ -50,8 +51,9 @@ def run(args: argparse.Namespace) -> int:
     else:
         if args.scene or args.up or args.fps:
             raise InputError("--scene, --up and --fps do not go with --checkpoint: TARGET is the scene itself")
-        options = {"device": args.device, "keep": args.keep, "resample": args.resample}
-        simulation = open_simulation(args.checkpoint, args.target, n_steps=args.steps, start=args.start, **options)
+        restored = restore(args.checkpoint, args.device)
+        scene = restored.open_scene(args.target, args.keep, args.resample)
+        simulation = Simulation(restored, scene, args.steps, args.start)
         target = simulation.target
     with Viewer(target, simulation, host=PUBLIC if args.public else LOCAL, port=args.port) as viewer:
         print(f"{target.name}: {target.n_frames} frames at {viewer.address} (Ctrl-C ends)", flush=True)

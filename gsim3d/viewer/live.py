@@ -27,6 +27,7 @@ AWAKE_COLOR, FROZEN_COLOR, ASLEEP_COLOR = (0.95, 0.5, 0.1), (0.55, 0.55, 0.55), 
 FASTEST = 0.99  # quantile of the speeds that has the last colour
 LATENT_RANGE = 0.02  # quantile of the latents that is black; as many are at full brightness
 KEPT_FRAMES = 128
+HELD = (3e-4, 200.0)  # standard deviations whose squares are neither 0 nor infinite in half precision
 SPEEDS = (0.1, 4.0)  # of the timeline, relative to real time
 SIZES = (0.05, 1.0)  # of the drawn Gaussians, relative to their own
 
@@ -337,32 +338,20 @@ class Target:
         return np.concatenate(images, 1)
 
 
-@dataclass(frozen=True)
-class Splatting:
-    """Gaussians as arrays that a browser draws, float32.
+def splatting_of(gaussians: Gaussians, unit: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """What a browser draws, in units of ``unit`` metres, with covariances that half precision holds.
 
-    Attributes:
-        centers: [N, 3].
-        covariances: [N, 3, 3].
-        rgbs: [N, 3] in [0, 1], without view dependence.
-        opacities: [N, 1] in [0, 1].
+    Returns:
+        Centres [N, 3], covariances [N, 3, 3], colours [N, 3] in [0, 1] without view dependence, opacities [N, 1].
     """
-
-    centers: np.ndarray
-    covariances: np.ndarray
-    rgbs: np.ndarray
-    opacities: np.ndarray
-
-
-def splatting_of(gaussians: Gaussians, unit: float) -> Splatting:
-    """``gaussians`` in units of ``unit`` metres, with standard deviations that a half-precision covariance holds."""
     splats = splats_of(gaussians, None, Path("viewer"))
     rotations = rotation_matrices(torch.from_numpy(splats.quats)).numpy()
-    scaled = rotations * np.clip(splats.scales / unit, 3e-4, 200.0)[:, None]
+    scaled = rotations * np.clip(splats.scales / unit, *HELD)[:, None]
     rgbs = np.clip(colors_of(splats), 0, 1).astype(np.float32)
-    return Splatting(splats.means / unit, scaled @ scaled.transpose(0, 2, 1), rgbs, splats.opacities[:, None])
+    return splats.means / unit, scaled @ scaled.transpose(0, 2, 1), rgbs, splats.opacities[:, None]
 
 
 def unit_of(gaussians: Gaussians) -> float:
-    """Metres that standard deviations are best counted in: in it their median is in the middle of what is held."""
-    return 4 * float(gaussians.scales.median()) if len(gaussians.scales) and gaussians.scales.median() > 0 else 1.0
+    """Metres that standard deviations are best counted in: their median is then in the middle of HELD."""
+    median = float(gaussians.scales.median()) if len(gaussians.scales) else 0.0
+    return median / (HELD[0] * HELD[1]) ** 0.5 if median > 0 else 1.0

@@ -21,12 +21,6 @@ from gsim3d.viewer.targets import OPERATIONS, Simulation
 LOCAL, PUBLIC = "127.0.0.1", "0.0.0.0"
 MOST_CAMERAS = 16  # of a scene that are drawn, spread evenly
 TICK = 1 / 60  # seconds between looks at the clock
-LAYER_HINTS = {
-    "moving": "particles that may move",
-    "frozen": "particles of the static background",
-    "cameras": "cameras of the scene with their images",
-    "truth": "true image beside what its camera would see",
-}
 
 
 def load_viser() -> Any:
@@ -151,7 +145,7 @@ class Viewer:
         with gui.add_folder("Layers"):
             shown = ["moving", "frozen"] if target.particles else []
             for name in shown + (["cameras", "truth"] if self._cams else []):
-                box = gui.add_checkbox(name, True, hint=LAYER_HINTS[name])
+                box = gui.add_checkbox(name, True)
                 self._on(box, partial(self._change_layer, name, box))
             if target.gaussians(0) is not None:
                 coloring = gui.add_dropdown("Colours", target.colorings)
@@ -254,7 +248,7 @@ class Viewer:
             seen = self._target.seen(frame, self.layers)
             with self._server.atomic():
                 if seen is not None:
-                    self._draw_splats(splatting_of(seen, self._unit))
+                    self._draw_splats(*splatting_of(seen, self._unit))
                 self._draw_cameras(frame)
                 if self._beside is not None:
                     self._beside.visible = self.layers.truth
@@ -273,12 +267,11 @@ class Viewer:
             text += f", {1000 * self._simulation.seconds_a_step:.0f} ms a simulated step"
         return text
 
-    def _draw_splats(self, arrays: Any) -> None:
-        values = (arrays.centers, arrays.covariances, arrays.rgbs, arrays.opacities)
+    def _draw_splats(self, *arrays: np.ndarray) -> None:
         if self._splats is None:
-            self._splats = self._server.scene.add_gaussian_splats("/gaussians", *values, scale=self._unit)
+            self._splats = self._server.scene.add_gaussian_splats("/gaussians", *arrays, scale=self._unit)
         else:
-            self._splats.set_gaussians(*values)
+            self._splats.set_gaussians(*arrays)
 
     def _draw_cameras(self, frame: int) -> None:
         if not self._cams:

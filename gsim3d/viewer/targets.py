@@ -16,7 +16,7 @@ from gsim3d.effects.spec import OutputEffects
 from gsim3d.errors import InputError
 from gsim3d.io.sequence import GAUSSIANS, open_sequence
 from gsim3d.state import Gaussians
-from gsim3d.train.restore import Restored, restore
+from gsim3d.train.restore import Restored
 from gsim3d.viewer.live import Target
 
 FPS = 24.0  # of files that do not say
@@ -41,11 +41,9 @@ class Simulation:
             n_steps: to predict; None: to the end of the recording.
             start: first input step.
         Raises:
-            InputError: the scene is too short, or not one that the simulator can predict.
+            InputError: the scene has too few steps or cameras.
         """
         simulator, self.edits, self.seconds_a_step = restored.simulator, (), 0.0
-        if simulator.inputs is None:
-            raise InputError("the checkpoint does not say which steps and views its simulator takes")
         self._simulator, self._spec = simulator, dataclasses.replace(restored.plan.spec, outputs=OutputEffects())
         frames = scene.input_frames(simulator.inputs, start=start)
         strides = simulator.inputs.background_stride, simulator.inputs.body_stride
@@ -163,33 +161,6 @@ def open_target(
         scene=recorded,
         first=0 if recorded is None else _checked(recorded, start),
     )
-
-
-def open_simulation(
-    checkpoint: str | Path,
-    scene: str | Path,
-    *,
-    n_steps: int | None = None,
-    start: int = 0,
-    device: str = "cpu",
-    keep: Sequence[str] = (),
-    resample: bool = False,
-) -> Simulation:
-    """A scene as the simulator of a checkpoint predicts it.
-
-    Args:
-        checkpoint: as of ``gsim3d simulate``.
-        scene: folder of a recorded scene.
-        n_steps: to predict; None: to the end of the recording.
-        start: first input step.
-        device: "cpu" or "cuda".
-        keep: as of :meth:`gsim3d.train.restore.Restored.open_scene`.
-        resample: the same.
-    Raises:
-        InputError: as :func:`gsim3d.train.restore.restore` and :class:`Simulation`.
-    """
-    restored = restore(checkpoint, device)
-    return Simulation(restored, restored.open_scene(scene, keep, resample), n_steps, start)
 
 
 def _is_scene(folder: Path) -> bool:

@@ -20,6 +20,7 @@ from gsim3d.io import read_splats, write_ply
 from gsim3d.io.sequence import write_about
 from gsim3d.math.spherical_harmonics import SH_0
 from gsim3d.state import ASLEEP, DYNAMIC, FROZEN, Gaussians
+from gsim3d.train.restore import restore
 from gsim3d.viewer import server
 from gsim3d.viewer.live import (
     ASLEEP_COLOR,
@@ -31,7 +32,7 @@ from gsim3d.viewer.live import (
     splatting_of,
     unit_of,
 )
-from gsim3d.viewer.targets import Simulation, open_simulation, open_target
+from gsim3d.viewer.targets import Simulation, open_target
 from tests.test_simulator import SIZE, make_simulator
 from tests.tiny_scenes import N_CAMS, write_scene
 from tests.viewer.browser import Browser, chromium
@@ -71,7 +72,12 @@ def checkpoint(tmp_path_factory):
 
 @pytest.fixture
 def simulation(checkpoint, scene) -> Simulation:
-    return open_simulation(checkpoint, scene, n_steps=3)
+    return simulated(checkpoint, scene, 3)
+
+
+def simulated(checkpoint, scene, n_steps) -> Simulation:
+    restored = restore(checkpoint)
+    return Simulation(restored, restored.open_scene(scene), n_steps)
 
 
 def test_timeline_advances_at_its_speed_and_loops():
@@ -162,12 +168,12 @@ def test_size_and_coloring_change_what_is_seen_and_exported(tmp_path):
 def test_splatting_has_covariances_that_half_precision_holds(scale):
     gaussians = dataclasses.replace(splats([[1.0, 2.0, 3.0]]), scales=torch.tensor([[1.0, 2.0, 3.0]]) * scale)
     unit = unit_of(gaussians)
-    arrays = splatting_of(gaussians, unit)
+    centers, covariances, rgbs, _ = splatting_of(gaussians, unit)
     expected = np.diag([1.0, 4.0, 9.0]) * scale**2
-    held = arrays.covariances[0].astype(np.float16).astype(np.float64)
+    held = covariances[0].astype(np.float16).astype(np.float64)
     np.testing.assert_allclose(held * unit**2, expected, rtol=1e-3)
-    np.testing.assert_allclose(arrays.centers[0] * unit, [1, 2, 3], rtol=1e-6)
-    np.testing.assert_allclose(arrays.rgbs[0], RED, rtol=1e-5)
+    np.testing.assert_allclose(centers[0] * unit, [1, 2, 3], rtol=1e-6)
+    np.testing.assert_allclose(rgbs[0], RED, rtol=1e-5)
 
 
 def test_scene_shows_its_cameras_and_images(scene):
@@ -255,7 +261,7 @@ def test_simulate_on_equals_one_rollout_with_all_edits(simulation, checkpoint, s
     assert target.n_frames == 6 and [edit.step for edit in simulation.edits] == [1, 2]
     assert torch.equal(target.particles[2].means, first)
     assert (target.particles[3].means - first)[:, 2].mean() > 0.3
-    again = open_simulation(checkpoint, scene, n_steps=1)
+    again = simulated(checkpoint, scene, 1)
     state, plan = again._state, again._simulator.plan(again._spec)
     with torch.no_grad():
         steps = again._simulator.rollout(state, 4, plan, edits=simulation.edits)
