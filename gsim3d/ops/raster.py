@@ -129,7 +129,7 @@ def rasterize_gaussians(
     _check_choices(sh, colors, cutoff, jacobian)
     check_on_invalid(on_invalid)
     n, n_images = means.shape[0], cameras.viewmats.shape[0]
-    rows |= {"sh": sh} if colors is None else {"colors": colors}
+    rows |= {"sh": sh} if colors is None else {"colors": colors}  # type: ignore[dict-item]  # one of them is given
     rows["features"] = means.new_empty(n, 0) if features is None else features
     if on_invalid == "clamp":
         _check_rows(rows)
