@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsim3d._core import constants
 from gsim3d.numerics.policy import LARGEST
-from gsim3d.ops._arguments import check_numbers, check_real, check_tensors, check_whole
+from gsim3d.ops._arguments import check_real, check_tensors, check_whole
 from gsim3d.ops._register import fake, refuse
 
 CELLS: int = constants["validate_cells"]  # of a workspace along each axis
@@ -147,7 +147,6 @@ def join_records(records: Sequence[PartialRecord]) -> Tensor:
     for record in records:
         check_tensors("join_records", parts=record.parts, cu_rows=record.cu_rows)
         check_whole("join_records", n_rows=record.n_rows)
-        check_numbers("join_records", parts=record.parts)
     parts, cu_rows, n_rows, *_ = zip(*records, strict=True)
     return torch.ops.gsim3d.join_records(list(parts), list(cu_rows), list(n_rows))
 
