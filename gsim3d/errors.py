@@ -52,7 +52,7 @@ class CaptureError(RuntimeError):
 
 
 class FitWarning(UserWarning):
-    """A scene is changed to fit a model; the message says what is changed and how to keep it."""
+    """Data is changed to fit a model or a file format; the message says what is changed and how to keep it."""
 
 
 class GradientError(NotImplementedError):

@@ -37,7 +37,7 @@ from gsim3d.dynamics import (
     rollout,
     rollout_in_parts,
 )
-from gsim3d.effects.edits import Edit, by_step
+from gsim3d.effects.edits import Edit, by_step, structure_of
 from gsim3d.effects.plan import Plan, by_plan, make_plan, unused_parameters
 from gsim3d.effects.selection import any_mask
 from gsim3d.effects.spec import EffectsSpec, OutputEffects, UnsupportedEffect
@@ -131,7 +131,7 @@ class Simulator(nn.Module):
             source: input images, or anything that gives them: :class:`gsim3d.data.Scene`, or an own class with a method
                 ``input_frames(inputs)`` (:class:`gsim3d.cameras.FrameSource`), or particles that are encoded.
             steps: how many to predict, at least 1.
-            plan: what to compute; None: that of :meth:`plan`.
+            plan: what to compute; None: that of :meth:`plan`, with particles inserted and removed as ``edits`` do.
             cameras: of the images of each step; None: none are drawn.
             background: [3] or [I, 3], of the images; default black.
             edits: changes of the scene on the way.
@@ -143,6 +143,8 @@ class Simulator(nn.Module):
             InputError: ``steps`` is below 1, the images have another size than those of the training, or an edit cannot
                 be made.
         """
+        if plan is None:
+            plan = self.plan(dataclasses.replace(self.effects, structure=structure_of(edits)))
         return predict(self, source, steps, plan, cameras, background, edits, wrap=wrap, log=log)
 
     def encode(

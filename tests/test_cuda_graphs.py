@@ -104,17 +104,17 @@ def test_graph_grows_when_more_particles_move(device):
 def test_prepared_state_holds_initial_latents(device):
     """Guards compare a step with the one before it, field by field."""
     state = make_state(device=device)
-    symmetric, relit = (
+    symmetric, relightable = (
         make_simulator(device, dynamics=dataclasses.replace(CONFIG.dynamics, background=background))
         for background in ("symmetric", "relightable")
     )
     assert symmetric._prepare(state, symmetric.plan()).initial_latents is None
-    prepared = relit._prepare(state, relit.plan())
+    prepared = relightable._prepare(state, relightable.plan())
     assert_same_bits(prepared.initial_latents, prepared.dynamic_latents)
-    step = rolled_out(relit, state, 2)[-1]
+    step = rolled_out(relightable, state, 2)[-1]
     frozen = step.activity == FROZEN
     assert frozen.any() and not torch.equal(step.initial_latents[frozen], step.dynamic_latents[frozen])
-    again = relit._prepare(step, relit.plan())
+    again = relightable._prepare(step, relightable.plan())
     assert_same_bits(again.initial_latents, step.initial_latents)
 
 

@@ -11,6 +11,7 @@ from gsim3d.cameras import InputSpec
 from gsim3d.compat import load_released
 from gsim3d.compat.released_model import ReleasedModelConfig, ReleasedSimulator
 from gsim3d.data import Scene
+from gsim3d.effects.edits import Edit, Remove
 from gsim3d.effects.spec import DynamicsEffects, EffectsSpec
 from gsim3d.errors import InputError
 from gsim3d.io import checkpoint
@@ -70,6 +71,13 @@ def test_predict_is_encode_rollout_and_render(simulator):
     assert_same_bits(prediction.steps[-1].means, steps[-1].means)
     assert_same_bits(prediction.renderings[-1].color, image.color)
     assert simulator.predict(frames, 1).renderings == []
+
+
+def test_predict_allows_what_its_edits_do(simulator):
+    moving = simulator.predict(make_frames((2,)), 1, edits=[Edit(0, Remove("frozen"))]).steps[-1]
+    assert moving.n_rows < simulator.predict(make_frames((2,)), 1).steps[-1].n_rows
+    with pytest.raises(InputError, match="remove"):
+        simulator.predict(make_frames((2,)), 1, simulator.plan(), edits=[Edit(0, Remove("frozen"))])
 
 
 def test_speed_is_read_beside_the_weights(folder):

@@ -118,7 +118,7 @@ def current_weights(weights: Mapping[str, Tensor], dynamics: DynamicsConfig) -> 
     The products of the network have the same columns in the same order as before, so that results have equal bits.
     """
     weights, start = dict(weights), "dynamics.priors."
-    stem, told = "dynamics.net.stem.conv.weight", weights.pop("dynamics.net.stem.told.weight", None)
+    stem, conditioning = "dynamics.net.stem.conv.weight", weights.pop("dynamics.net.stem.told.weight", None)
     if not dynamics.priors or stem not in weights or any(name.startswith(start) for name in weights):
         return weights
     for old, new in PARAMETERS.items():
@@ -128,15 +128,15 @@ def current_weights(weights: Mapping[str, Tensor], dynamics: DynamicsConfig) -> 
     layout = StateLayout.of(dynamics, priors)
     convolved = weights[stem]
     weights[stem] = convolved[..., : layout.in_channels].clone()
-    column, told_column = layout.in_channels, 0
+    column, cond_column = layout.in_channels, 0
     for prior in priors:
         own = f"{start}{prior.name}"
         if n := prior.n_conv_features:
             weights[f"{own}.conv_proj.weight"] = convolved[..., column : column + n].clone()
             column += n
-        if (n := prior.n_features) and told is not None:
-            weights[f"{own}.in_proj.weight"] = told[:, told_column : told_column + n].clone()
-            told_column += n
+        if (n := prior.n_features) and conditioning is not None:
+            weights[f"{own}.in_proj.weight"] = conditioning[:, cond_column : cond_column + n].clone()
+            cond_column += n
     return weights | _split_head(weights, layout)
 
 

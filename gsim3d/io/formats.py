@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsim3d.errors import InputError
+from gsim3d.errors import FitWarning, InputError
 from gsim3d.io import compressed_ply, gltf, splat, spz, usd
 from gsim3d.io.arrays import Y_TO_Z_UP, Z_TO_Y_UP, Splats, gaussians_of, read_head, splats_of, turned
 from gsim3d.io.ply import read_ply, write_ply
@@ -86,6 +87,9 @@ def write_splats(
         raise InputError(f"{path}: frames a second must be positive; got {fps}")
     parts = [gaussians] if isinstance(gaussians, Gaussians) else list(gaussians)
     turn = _turn(path, chosen, up, Z_TO_Y_UP)
+    keeps_offset = suffix == ".ply" and turn is None
+    if not keeps_offset:
+        _warn_of_offset(path, parts)
     if chosen.has_time:
         frames = [
             splats_of(part, index, path)
@@ -98,7 +102,7 @@ def write_splats(
         return
     if len(parts) != 1:
         raise InputError(f"{path}: {suffix} holds one frame; got {len(parts)}: choose a frame, or .usdc")
-    if suffix == ".ply" and turn is None:
+    if keeps_offset:
         write_ply(path, parts[0], frame)
         return
     splats = splats_of(parts[0], frame, path)
@@ -107,6 +111,15 @@ def write_splats(
         write_ply(path, gaussians_of(splats, path))
     else:
         chosen.write(path, splats)
+
+
+def _warn_of_offset(path: Path, parts: Sequence[Gaussians]) -> None:
+    """Warns where Gaussians lose their ``world_offset``: only a .ply whose z axis points up keeps it."""
+    offset = next((p.world_offset for p in parts if p.world_offset is not None and bool(p.world_offset.any())), None)
+    if offset is not None:
+        first = ", ".join(f"{x:.2f}" for x in offset[0].tolist())
+        message = f"{path}: positions count from ({first}) m in the world, which is not kept; a .ply with z up keeps it"
+        warnings.warn(message, FitWarning, stacklevel=3)
 
 
 def read_splats(path: str | Path, *, up: str | None = None) -> Gaussians:
@@ -126,7 +139,10 @@ def read_splats(path: str | Path, *, up: str | None = None) -> Gaussians:
         chosen = FORMATS[".compressed.ply"]
     if chosen.read is None:
         gaussians = read_ply(path)
-        return gaussians if turn is None else gaussians_of(turned(splats_of(gaussians, None, path), turn), path)
+        if turn is None:
+            return gaussians
+        _warn_of_offset(path, [gaussians])
+        return gaussians_of(turned(splats_of(gaussians, None, path), turn), path)
     try:
         splats = gaussians_of(chosen.read(path), path)
     except MemoryError:

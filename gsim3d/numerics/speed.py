@@ -178,7 +178,7 @@ def predict(
     simulator: Any,
     source: Frames | FrameSource | Particles,
     steps: int,
-    plan: Plan | None,
+    plan: Plan,
     cameras: Cameras | None,
     background: torch.Tensor | None,
     edits: Sequence[Edit],
@@ -187,7 +187,7 @@ def predict(
     """:meth:`gsim3d.Simulator.predict`, as the setting of the simulator says; ``options`` are those of the rollout."""
     if steps < 1:
         raise InputError(f"predict: steps must be at least 1; got {steps}")
-    state, plan = source if isinstance(source, Particles) else encode(simulator, source), plan or simulator.plan()
+    state = source if isinstance(source, Particles) else encode(simulator, source)
     setting, device = simulator.setting, state.means.device
     with setting.precision("dynamics", device.type):
         if setting.captured and not edits and device.type == "cuda":

@@ -220,11 +220,11 @@ class Prior(nn.Module):
 
     def conv_features(self, ctx: StepContext) -> Tensor:
         """[M, n_conv_features] of all M particles of the history, convolved with their neighbours'."""
-        raise NotImplementedError
+        raise TypeError(f"{type(self).__name__} has n_conv_features and must define conv_features()")
 
     def features(self, ctx: StepContext) -> Tensor:
         """[M, n_features] of all M particles of the history, read particle by particle."""
-        raise NotImplementedError
+        raise TypeError(f"{type(self).__name__} has n_features and must define features()")
 
     def move(self, motion: Motion, gains: Tensor, ctx: StepContext) -> Motion:
         """``motion`` as this prior leaves it; gains [N, n_gains] as predicted, without bounds."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -73,7 +74,7 @@ class DirectionalLightConfig(PriorConfig):
         return LambertianLight(self) if self.shading == "lambert" else OcclusionLight(self)
 
 
-class _Light(Prior):
+class _Light(Prior, ABC):
     """Colours of a particle are multiplied by its irradiance now over that when it was encoded.
 
     ``light_occlusion`` holds, for L lamps, columns of the time of encoding, then L of now; the network sees the last L
@@ -89,13 +90,13 @@ class _Light(Prior):
         super().__init__(config)
         self.n_features = 2 * len(config.directions)
 
+    @abstractmethod
     def occlusion(self, ctx: StepContext, known: Tensor | None) -> tuple[Tensor, Tensor]:
         """Columns at encoding, if that were now, and columns of now; ``known``: those of ``ctx.state`` so far."""
-        raise NotImplementedError
 
+    @abstractmethod
     def log_gain(self, occlusion: Tensor) -> Tensor:
         """[N, 3], the logarithm of the irradiance now over that at encoding."""
-        raise NotImplementedError
 
     def initialize(self, particles: Particles, ctx: StepContext, frames: Frames | None = None) -> Particles:
         """``particles`` whose newest clouds know their light; its time of encoding defaults to now."""
@@ -119,9 +120,9 @@ class _Light(Prior):
         gain = self._gain(ctx, self.log_gain(found), gains)
         return replace(step, light_occlusion=found, irradiance_gain=gain)
 
+    @abstractmethod
     def _gain(self, ctx: StepContext, log_gain: Tensor, predicted: Tensor | None) -> Tensor:
         """[N, 3]; not relative to the step before, or its errors would add up."""
-        raise NotImplementedError
 
     def _updated(self, ctx: StepContext, known: Tensor | None) -> Tensor:
         n = len(self.config.directions)

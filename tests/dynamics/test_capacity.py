@@ -11,7 +11,7 @@ from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import EXPLICIT, SEEING, TINY, batch, float_fields, make_dynamics, make_history
 
 MOVING = dataclasses.replace(TINY, priors=SEEING)
-RELIT = dataclasses.replace(MOVING, background="relightable")
+RELIGHTABLE = dataclasses.replace(MOVING, background="relightable")
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 SIZES = [[(40, 30)], [(1,)], [(0, 12)], [(12, 0)], [(40, 30), (3,), (5, 6, 7), (60, 0, 1, 2)]]
@@ -31,7 +31,7 @@ def with_room(dynamics, history, factor=1.25, generator=None):
 
 
 @pytest.mark.parametrize("asleep", [False, True])
-@pytest.mark.parametrize("config", [TINY, EXPLICIT, MOVING, RELIT])
+@pytest.mark.parametrize("config", [TINY, EXPLICIT, MOVING, RELIGHTABLE])
 @pytest.mark.parametrize("sizes", SIZES)
 @pytest.mark.parametrize("factor", [1.0, 1.25, 4.0])
 def test_capacity_changes_no_bit(factor, sizes, config, asleep):
@@ -92,7 +92,7 @@ def test_overflow_is_counted():
 
 
 def test_unseen_particles_need_no_capacity():
-    dynamics, history = make_dynamics(RELIT), some_asleep(make_history((400, 300, 200), frozen_share=0.8))
+    dynamics, history = make_dynamics(RELIGHTABLE), some_asleep(make_history((400, 300, 200), frozen_share=0.8))
     assert dynamics.room(history) < 0.6 * history.n_rows
     assert make_dynamics(MOVING).room(history) == history.n_rows
     pyramid = with_room(dynamics, history, 1.0)
@@ -103,7 +103,7 @@ def test_unseen_particles_need_no_capacity():
 
 
 def test_too_many_seen_particles_are_counted():
-    dynamics, history = make_dynamics(RELIT), make_history((40, 30), frozen_share=0.8)
+    dynamics, history = make_dynamics(RELIGHTABLE), make_history((40, 30), frozen_share=0.8)
     exact = dynamics.geometry(history)
     n_seen = exact.stages[0].n_rows
     roomy = PyramidCapacity.of(exact, dynamics.room(history))

@@ -10,7 +10,7 @@ from gsim3d.state import DYNAMIC, FROZEN
 from tests.asserts import assert_same_bits
 from tests.dynamics.scenes import EXPLICIT, SEEING, TINY, batch, float_fields, make_dynamics, make_history
 
-RELIT = dataclasses.replace(TINY, background="relightable", priors=SEEING)
+RELIGHTABLE = dataclasses.replace(TINY, background="relightable", priors=SEEING)
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
@@ -25,7 +25,7 @@ def with_latents(particles, rows, latents):
 
 
 def test_the_network_sees_the_background_in_the_newest_step_only():
-    dynamics, history = make_dynamics(RELIT), make_history((40, 40, 30))
+    dynamics, history = make_dynamics(RELIGHTABLE), make_history((40, 40, 30))
     older = frozen_rows(history) & (history.row_cloud() < 2)
     assert older.any()
     other = with_latents(history, older, torch.full_like(history.dynamic_latents, 9.0))
@@ -35,12 +35,12 @@ def test_the_network_sees_the_background_in_the_newest_step_only():
     newest = frozen_rows(history) & (history.row_cloud() == 2)
     seen = with_latents(history, newest, torch.full_like(history.dynamic_latents, 9.0))
     assert not torch.equal(dynamics(seen).means, dynamics(history).means)
-    symmetric = make_dynamics(dataclasses.replace(RELIT, background="symmetric"))
+    symmetric = make_dynamics(dataclasses.replace(RELIGHTABLE, background="symmetric"))
     assert not torch.equal(symmetric(other).means, symmetric(history).means)
 
 
 def test_what_was_predicted_of_the_background_is_not_seen_again():
-    dynamics, history = make_dynamics(RELIT), make_history((30, 30))
+    dynamics, history = make_dynamics(RELIGHTABLE), make_history((30, 30))
     history = with_attribute(history, "initial_latents")
     frozen = frozen_rows(history)
     dark = with_latents(history, frozen, torch.full_like(history.dynamic_latents, -3.0))
@@ -56,7 +56,7 @@ def test_what_was_predicted_of_the_background_is_not_seen_again():
 @pytest.mark.parametrize("features, is_seen", [("all", False), ("dynamic", False), ("frozen", True), ("none", True)])
 def test_what_was_predicted_of_bodies_is_not_seen_again_where_their_look_changes(features, is_seen):
     """Else it is what they were given, or were made to be."""
-    dynamics, history = make_dynamics(RELIT), with_attribute(make_history((30, 30)), "initial_latents")
+    dynamics, history = make_dynamics(RELIGHTABLE), with_attribute(make_history((30, 30)), "initial_latents")
     bodies = history.activity == DYNAMIC
     dark = with_latents(history, bodies, torch.full_like(history.dynamic_latents, -3.0))
     changes = dynamics.layout.changes(features)
@@ -66,7 +66,7 @@ def test_what_was_predicted_of_bodies_is_not_seen_again_where_their_look_changes
 
 def test_a_background_in_front_of_which_nothing_changes_does_not_change():
     """Else the same prediction would be added in every step."""
-    dynamics, history = make_dynamics(RELIT), make_history((30, 30, 30, 30))
+    dynamics, history = make_dynamics(RELIGHTABLE), make_history((30, 30, 30, 30))
     still = {name: value[:30].repeat(4, *[1] * (value.dim() - 1)) for name, value in history.row_fields().items()}
     history = history.with_clouds(history.clouds, **still)
     bodies, frozen = (last_steps(history, 1).activity == kind for kind in (DYNAMIC, FROZEN))
@@ -88,7 +88,7 @@ def test_a_background_in_front_of_which_nothing_changes_does_not_change():
 
 
 def test_a_rollout_goes_on_from_its_own_steps():
-    dynamics = make_dynamics(RELIT)
+    dynamics = make_dynamics(RELIGHTABLE)
     history = batch([make_history((30, 20)), make_history((10, 25), 1)])
     whole = rollout(dynamics, history, 5, 4)
     begun = rollout(dynamics, history, 2, 4)
@@ -101,7 +101,7 @@ def test_a_rollout_goes_on_from_its_own_steps():
 
 
 def test_scenes_do_not_change_each_other():
-    dynamics = make_dynamics(RELIT)
+    dynamics = make_dynamics(RELIGHTABLE)
     histories = [make_history((30, 20), 1), make_history((15, 25), 2)]
     together = dynamics(batch(histories))
     alone = [dynamics(history) for history in histories]
@@ -110,7 +110,7 @@ def test_scenes_do_not_change_each_other():
 
 
 def test_gradients_flow_to_how_the_background_began():
-    dynamics, history = make_dynamics(RELIT), make_history((30, 30))
+    dynamics, history = make_dynamics(RELIGHTABLE), make_history((30, 30))
     latents = history.dynamic_latents.requires_grad_()
     steps = rollout(dynamics, history, 3, 4)
     (gradient,) = torch.autograd.grad(steps[-1].dynamic_latents.square().sum(), [latents])

@@ -309,9 +309,9 @@ def test_removed_particles_occlude_no_light(step):
     """The conditioning features of the network, from the step of the edit on."""
     config = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, priors=(OCCLUSION,)))
     simulator, state, _ = encoded(config)
-    told = []
+    occluded = []
     simulator.dynamics.register_forward_pre_hook(
-        lambda _, args: told.append(last_steps(args[0], 1).light_occlusion[:, 1])
+        lambda _, args: occluded.append(last_steps(args[0], 1).light_occlusion[:, 1])
     )
     future(simulator, state, 2, [Edit(step, Remove("moving"))])
-    assert len(told) == 2 and [bool(now.any()) for now in told] == [step > 0, False]
+    assert len(occluded) == 2 and [bool(now.any()) for now in occluded] == [step > 0, False]

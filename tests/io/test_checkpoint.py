@@ -114,11 +114,11 @@ def test_full_disk_raises_and_keeps_last_checkpoint(tmp_path, room):
     try:
         with pytest.raises(
             InputError, match="step_000010: cannot be written: File too large; checkpoints before it"
-        ) as told:
+        ) as refused:
             checkpoint.save(tmp_path, example(10))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert "make room" in str(told.value)
+    assert "make room" in str(refused.value)
     assert sorted(path.name for path in (tmp_path / "checkpoints").iterdir()) == ["last", "step_000005"]
     assert checkpoint.load(tmp_path).state["step"] == 5
     checkpoint.save(tmp_path, example(10))

@@ -12,7 +12,7 @@ import torch
 
 from gsim3d.cameras import Cameras
 from gsim3d.cli.main import main
-from gsim3d.errors import InputError
+from gsim3d.errors import FitWarning, InputError
 from gsim3d.io import FORMATS, read_splats, write_ply, write_splats
 from gsim3d.io.arrays import Y_TO_Z_UP, Z_TO_Y_UP, splats_of, turned
 from gsim3d.io.orbit import orbit_frames
@@ -126,6 +126,24 @@ def test_spz_of_version_2_is_read(tmp_path):
     read = read_splats(tmp_path / "old.spz", up="z")
     assert read.means.tolist() == [[1.0, -1.0, 0.0]] and read.opacities.tolist() == [1.0]
     assert read.scales.tolist() == [[1.0] * 3] and read.quats[0, 3] == pytest.approx(1, abs=1e-4)
+
+
+@pytest.mark.parametrize("suffix", [".splat", ".compressed.ply", ".spz", ".glb"])
+def test_formats_without_world_offset_warn(suffix, tmp_path):
+    offset = torch.tensor([[5e5, 4e6, 0.0]], dtype=torch.float64)
+    gaussians = dataclasses.replace(make(3, 1), world_offset=offset)
+    with pytest.warns(FitWarning, match=r"count from \(500000.00, 4000000.00, 0.00\) m .* not kept"):
+        write_splats(tmp_path / f"a{suffix}", gaussians)
+    with pytest.warns(FitWarning, match="not kept"):
+        write_splats(tmp_path / "turned.ply", gaussians, up="y")
+
+
+def test_ply_keeps_world_offset_or_warns_when_turned(tmp_path, recwarn):
+    offset = torch.tensor([[5e5, 4e6, 0.0]], dtype=torch.float64)
+    write_splats(tmp_path / "a.ply", dataclasses.replace(make(3, 1), world_offset=offset))
+    assert read_splats(tmp_path / "a.ply").world_offset is not None and not recwarn.list
+    with pytest.warns(FitWarning, match="not kept"):
+        read_splats(tmp_path / "a.ply", up="y")
 
 
 @pytest.mark.parametrize("degree, streams", [(0, 5), (1, 6)])

@@ -15,7 +15,7 @@ from tests.priors.scenes import with_priors
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-TOLD = with_priors(
+CONDITIONED = with_priors(
     dataclasses.replace(TINY, background="relightable", priors=SEEING),
     InertiaConfig(radius=0.2, rotate_appearance=True),
     ShapeMatchingConfig(radius=0.2, stiffness=0.3),
@@ -64,7 +64,7 @@ def test_packing_gradients():
 
 
 def test_capacity_of_movable_particles_changes_nothing(device):
-    history, dynamics = scenes(device), make_dynamics(TOLD).to(device)
+    history, dynamics = scenes(device), make_dynamics(CONDITIONED).to(device)
     gains = [prior.gain_head for prior in dynamics.priors if prior.gain_head]
     for parameter in (p for module in (dynamics.net.head, *gains) for p in module.parameters()):
         torch.nn.init.normal_(parameter, 0, 0.02, generator=torch.Generator(device).manual_seed(0))

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 LENGTH = 0.15
 NEAR, SOLID = ProximityConfig(range=LENGTH), ProximityConfig().min_opacity
-TOLD = with_priors(TINY, PositionWavesConfig(count=3), NEAR)
+CONDITIONED = with_priors(TINY, PositionWavesConfig(count=3), NEAR)
 SPACING = 0.05
 
 
@@ -122,7 +122,7 @@ def test_compiled(device):
 
 @pytest.mark.parametrize("name", ["position_waves", "proximity"])
 def test_network_reads_features(name):
-    dynamics, history = make_dynamics(TOLD), above_ground([0.02, 0.05])
+    dynamics, history = make_dynamics(CONDITIONED), above_ground([0.02, 0.05])
     before = dynamics(history)
     torch.nn.init.normal_(dynamics.priors.get(name).in_proj.weight)
     assert (dynamics(history).means - before.means).abs().max() > 1e-5
@@ -139,7 +139,7 @@ def test_position_waves():
 
 
 def test_relightable_background_of_older_steps_is_ignored():
-    relightable = with_priors(TOLD, InertiaConfig(radius=0.2), background="relightable")
+    relightable = with_priors(CONDITIONED, InertiaConfig(radius=0.2), background="relightable")
     dynamics, history = make_dynamics(relightable), above_ground([0.02, 0.05])
     older = (history.activity == FROZEN) & (history.row_cloud() == 0)
     moved = dataclasses.replace(history, means=torch.where(older[:, None], history.means + 0.05, history.means))
@@ -148,7 +148,7 @@ def test_relightable_background_of_older_steps_is_ignored():
 
 def test_asymmetric_background_is_refused():
     with pytest.raises(ValueError, match='proximity needs background "symmetric"'):
-        dataclasses.replace(TOLD, background="asymmetric")
+        dataclasses.replace(CONDITIONED, background="asymmetric")
 
 
 @pytest.mark.parametrize("count", [0, 17])

@@ -35,8 +35,8 @@ NUMBERS = (b"0", b"-1", b"999999999999", b"4294967296", b"1e309", b"nan", b"1844
 def damage(folder: Path, rng: random.Random, descriptions: tuple[str, ...]) -> str:
     """Damages one file, more often a description than another; what was done."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())
-    told = [path for path in files if path.name in descriptions]
-    file = rng.choice(told) if told and rng.random() < 0.65 else rng.choice(files)
+    described = [path for path in files if path.name in descriptions]
+    file = rng.choice(described) if described and rng.random() < 0.65 else rng.choice(files)
     kinds = [_bytes, _bytes, _place]
     if file.suffix in (".json", ".yaml"):
         kinds += [_structure] * 6
