@@ -1,4 +1,4 @@
-"""What the live viewer shows: a target, the frame of a timeline, layers and colours. It knows no browser."""
+"""What the live viewer shows: a target, the frame of a timeline, layers and colours. Independent of the browser."""
 
 from __future__ import annotations
 
