@@ -1,4 +1,4 @@
-"""``gsim3d profile``: what accuracy costs in time."""
+"""``gsim3d profile``: accuracy against time."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from gsim3d.io.terminal import progress
 from gsim3d.pretrained import CHECKPOINT_HELP
 
 EPILOG = """\
-Runs the simulator under every setting that it has here, one changed at a time: precision, graph capture, input views
-and steps, particles kept, sleep, patch and grid size, ... For each: how far it is from the reference run of the same
-checkpoint (float32, nothing left out) and from the video, and what a step takes, by section. Written to DIR:
-report.html (one page, needs no network), report.json, report.csv, a PNG of each figure. Beside the checkpoint:
-speeds.json, the fastest settings that keep 99.9 % ("balanced") and 99 % ("fast") of the reference's gain over particles
-that hold still, for --speed, and the times of the reference, by which `gsim3d plan` predicts milliseconds.
-Stopped and started again with the same DIR, it goes on where it was.
+Changes one setting of the simulator at a time: precision, graph capture, input views and steps, retained particles,
+sleep, patch and grid size, ... For each setting, it measures the error against the reference run (same checkpoint in
+float32) and against the video, and the time of a step by section. Written to DIR: report.html (one page, needs no
+network), report.json, report.csv and the figures as PNG. Written to the checkpoint: speeds.json, with the fastest
+settings that retain 99.9 % ("balanced") and 99 % ("fast") of the reference's gain over the constant baseline, for
+--speed, and the times of the reference, from which `gsim3d plan` predicts milliseconds.
+An interrupted command continues when it is run again with the same DIR.
 
 examples:
   gsim3d profile runs/model runs/data --out runs/profile
@@ -25,18 +25,18 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Measures what accuracy costs in time, for one trained simulator on this machine."
+    parser.description = "Measures accuracy against time of a trained simulator on this machine."
     parser.epilog = EPILOG
     add = parser.add_argument
     add("checkpoint", metavar="CHECKPOINT", help=CHECKPOINT_HELP)
     add("data", metavar="DATA", help="folder with scenes, or one scene folder")
-    scenes = "which of DATA: test, the scenes that `gsim3d train` holds out (default), or all: it is a held-out set"
+    scenes = "test: the scenes that `gsim3d train` holds out (default); all: every scene, for a held-out set"
     add("--scenes", choices=("test", "all"), default="test", help=scenes)
-    add("--out", metavar="DIR", required=True, help="folder of the report; made if absent")
-    add("--preset", choices=("quick", "full"), default="quick", help="how long to measure (default: quick)")
-    add("--settings", nargs="+", metavar="NAME", help="change only these (default: all)")
-    add("--metrics", nargs="+", metavar="METRIC", help="of the error against the video, as of gsim3d evaluate")
-    limit = "end in about so many; the report says what there was no time for (default: no limit)"
+    add("--out", metavar="DIR", required=True, help="folder of the report; created if absent")
+    add("--preset", choices=("quick", "full"), default="quick", help="number of measurements (default: quick)")
+    add("--settings", nargs="+", metavar="NAME", help="groups of settings to measure (default: all)")
+    add("--metrics", nargs="+", metavar="METRIC", help="scores against the video, as in gsim3d evaluate")
+    limit = "approximate time budget; the report lists skipped settings (default: no limit)"
     add("--minutes", type=number(0, 1e6, above=True), metavar="M", help=limit)
     add("--device", choices=("cpu", "cuda"), default="cpu", help="where to simulate (default: cpu)")
     add("--quiet", action="store_true", help="no progress bar")

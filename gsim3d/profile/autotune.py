@@ -1,4 +1,4 @@
-"""Finds the fastest setting that keeps a promise, and keeps it beside the weights."""
+"""Finds the fastest setting within an accuracy limit, and saves the tuned presets with the checkpoint."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from gsim3d.effects.plan import Workload
 from gsim3d.errors import InputError
 from gsim3d.evaluate.plan_report import TIMES, PartTimes
 from gsim3d.evaluate.report import write_json
+from gsim3d.io.machine import machine
 from gsim3d.numerics.speed import SPEEDS_FILE, Setting, read_speeds
 from gsim3d.profile.settings import GROUPS, Group
-from gsim3d.profile.sweep import MOST_KEPT, PRESETS, BenchmarkCase, Effort, Point, Sweep, tie
-from gsim3d.profile.timing import GAPS, machine
+from gsim3d.profile.sweep import MAX_CACHED, PRESETS, BenchmarkCase, Effort, Point, Sweep, tie
+from gsim3d.profile.timing import GAPS
 from gsim3d.state import DYNAMIC
 from gsim3d.train.restore import Restored
 
-# preset -> share of the reference's gain over particles held still, in dB, that it keeps at least
+# preset -> smallest share of the reference's gain (PSNR above the constant baseline, in dB) that it may retain
 PROMISES = {"exact": None, "balanced": 0.999, "fast": 0.99}
-PART_OF_SECTION = {"head": "gaussians", "sort and raster": "images", GAPS: "host"}  # all others: the dynamics
+PART_OF_SECTION = {"head": "gaussians", "sort and raster": "images", GAPS: "host"}  # other sections: "dynamics"
 
 
 def autotune(
@@ -33,16 +34,16 @@ def autotune(
     groups: Sequence[Group] = GROUPS,
     effort: Effort = Effort(),
 ) -> Point:
-    """The best setting within a limit, measured on ``case``.
+    """Measures settings on ``case`` and returns the best one within a limit.
 
     Args:
-        case: the simulator and scenes.
-        max_ms: of a step: the most accurate setting that is as fast.
-        min_agreement_psnr: against the reference, in dB: the fastest setting that is as near.
-        groups: of settings that may be taken.
-        effort: how long to measure; at least 3 rounds tell differences from noise.
+        case: simulator and scenes.
+        max_ms: largest time of a step in milliseconds; returns the most accurate setting within it.
+        min_agreement_psnr: smallest PSNR against the reference in dB; returns the fastest setting within it.
+        groups: settings to try.
+        effort: number of measurements; use at least 3 rounds to separate differences from noise.
     Raises:
-        InputError: not exactly one limit is given, or no setting keeps it; the message says how near one came.
+        InputError: not exactly one limit is given, or no setting is within it.
     """
     if (max_ms is None) == (min_agreement_psnr is None):
         raise InputError("autotune: give either max_ms or min_agreement_psnr")
@@ -53,24 +54,25 @@ def autotune(
         return fastest(sweep, points, lambda point: point.agreement.psnr >= min_agreement_psnr)
     usable = [p for p in points if not p.failure]
     if 1e3 * min(p.step_seconds for p in usable) > max_ms:
-        usable.append(fastest(sweep, points, lambda point: True))  # no setting alone is fast enough
+        usable.append(fastest(sweep, points, lambda point: True))  # no single setting is fast enough: combine them
     within = [p for p in usable if 1e3 * p.step_seconds <= max_ms]
     if within:
         return max(within, key=lambda p: p.agreement.psnr)
     least = 1e3 * min(p.step_seconds for p in usable)
-    raise InputError(f"autotune: no setting takes at most {max_ms:g} ms a step; the fastest takes {least:.3g}")
+    raise InputError(f"autotune: no setting takes at most {max_ms:g} ms a step; the fastest takes {least:.3g} ms")
 
 
 def tune(sweep: Sweep, points: Sequence[Point]) -> dict[str, Point]:
-    """The setting of each preset, from measured ``points``, of which the first is the reference."""
-    found = {}
-    for name, share in PROMISES.items():
-        found[name] = points[0] if share is None else fastest(sweep, points, keeping(sweep.case, points[0], share))
-    return found
+    """Returns the point of each preset in PROMISES, from measured ``points``, the reference first."""
+    case, reference = sweep.case, points[0]
+    return {
+        name: reference if share is None else fastest(sweep, points, keeping(case, reference, share))
+        for name, share in PROMISES.items()
+    }
 
 
 def keeping(case: BenchmarkCase, reference: Point, share: float) -> Callable[[Point], bool]:
-    """Whether a point keeps this share of the reference's gain."""
+    """Returns a predicate: whether a point retains at least ``share`` of the gain of ``reference``."""
 
     def keeps(point: Point) -> bool:
         kept = case.share_kept(point, reference)
@@ -80,7 +82,7 @@ def keeping(case: BenchmarkCase, reference: Point, share: float) -> Callable[[Po
 
 
 def fastest(sweep: Sweep, points: Sequence[Point], keeps: Callable[[Point], bool]) -> Point:
-    """The reference with every setting that keeps the promise and saves time, added one by one, measured together."""
+    """Greedily combines the settings that save time and satisfy ``keeps``, and measures each combination."""
     useful = [p for p in points[1:] if _saves(p, points) and keeps(p)]
     if not useful:
         return points[0]
@@ -99,7 +101,7 @@ def fastest(sweep: Sweep, points: Sequence[Point], keeps: Callable[[Point], bool
 
 
 def _both(sweep: Sweep, best: Point, point: Point) -> Point | None:
-    """Two settings in one; None where both change the same thing, or do not fit each other."""
+    """Combination of two settings; None if they change the same option or exclude each other."""
     changes, before = point.setting.to_dict(), best.setting.to_dict()
     if set(changes) & set(before) - {"captured"} or set(changes) <= set(before):
         return None
@@ -110,7 +112,7 @@ def _both(sweep: Sweep, best: Point, point: Point) -> Point | None:
 
 
 def _saves(point: Point, points: Sequence[Point]) -> bool:
-    """Whether the setting of ``point`` saves time, and not only the graph that it is replayed from."""
+    """Whether ``point`` saves time beyond what graph capture alone saves."""
     graph = next((p for p in points if p.setting == Setting(captured=True) and not p.failure), None)
     if graph is None or not point.setting.captured or point is graph:
         return _faster(point, points[0])
@@ -121,18 +123,15 @@ def _faster(point: Point, than: Point) -> bool:
     return not point.failure and point.step_seconds < than.step_seconds and not tie(point, than)
 
 
-# ---- what is kept beside the weights ----
-
-
 def part_times(case: BenchmarkCase, reference: Point) -> PartTimes | None:
-    """What the parts of a step of ``reference`` took on ``case``; None where its sections were not watched."""
+    """Milliseconds of the parts of a step of ``reference``; None if its sections were not recorded."""
     if not reference.sections():
         return None
     parts: dict[str, float] = {}
     for section, seconds in reference.sections().items():
         part = PART_OF_SECTION.get(section, "dynamics")
         parts[part] = parts.get(part, 0.0) + 1e3 * seconds
-    newest = [case.newest(number).activity for number in range(len(case.scenes))[:MOST_KEPT]]
+    newest = [case.newest(number).activity for number in range(len(case.scenes))[:MAX_CACHED]]
     moving = round(fmean(int((activity == DYNAMIC).sum()) for activity in newest))
     height, width = case.restored.image_size
     work = Workload(moving, round(fmean(map(len, newest))) - moving, len(case.views[0][1]), height * width)
@@ -141,7 +140,7 @@ def part_times(case: BenchmarkCase, reference: Point) -> PartTimes | None:
 
 
 def save_speeds(folder: Path, restored: Restored, presets: dict[str, Point], times: PartTimes | None = None) -> Path:
-    """Keeps the presets of a checkpoint on its device, and what its reference took, in ``folder``/speeds.json."""
+    """Saves presets and part times of a checkpoint on its device in ``folder``/speeds.json. Returns the path."""
     path, known = folder / SPEEDS_FILE, read_speeds(folder)
     digest, device = restored.checkpoint.digest, restored.device.type
     settings: dict[str, Any] = {name: point.setting.to_dict() for name, point in presets.items()}

@@ -1,4 +1,4 @@
-"""Which settings trade accuracy for time, and a trained simulator under one of them."""
+"""Settings that trade accuracy for time, and a trained simulator that runs under one of them."""
 
 from __future__ import annotations
 
@@ -25,29 +25,27 @@ if TYPE_CHECKING:
     from gsim3d.profile.sweep import BenchmarkCase
 
 KINDS = {
-    "exact": "changes what is simulated by rounding only",
-    "near-exact": "leaves out what is below a stated threshold",
+    "exact": "changes results by rounding only",
+    "near-exact": "skips contributions below a stated threshold",
     "model": "changes the function that the model computes",
 }
-TOGETHER = 4  # steps that are timed together where the first costs more than those that follow
+POWERS = [2**k for k in range(20)]
+TOGETHER = 4  # steps that are timed together if the first step costs more than later ones
 
 
 class Runner:
     """A trained simulator under one setting.
 
-        runner = Runner(restored, Setting(history=2))
-        state = runner.encode(runner.frames([scene], [cameras]))
-        for newest in runner.steps(state, 12):
-            images = runner.images(newest, cameras)
-
     Args:
-        restored: the simulator as it was trained.
+        restored: simulator as trained.
         setting: how to run it.
     Raises:
-        InputError: the model cannot do what the setting asks for.
+        InputError: the model does not support the setting.
 
     Attributes:
-        restored, simulator, plan: what runs.
+        simulator: simulator with the configuration of the setting.
+        plan: its plan.
+        restored: ``restored`` with both.
     """
 
     def __init__(self, restored: Restored, setting: Setting = Setting()):
@@ -57,56 +55,52 @@ class Runner:
         self.restored = replace(restored, simulator=self.simulator, plan=self.plan)
 
     def frames(self, scenes: Sequence[Scene], context: Sequence[Sequence[int]]) -> Frames:
-        """Input images of cameras ``context``: of the first steps, the last ones where fewer are encoded than in
-        training."""
+        """Input images of the cameras ``context``, one list a scene.
+
+        A shorter history than in training takes the last of the training's input steps.
+        """
         frames = input_frames(self.restored, scenes, context, self.restored.data.history - self.restored.n_encoded)
         return subsampled(frames, self.restored.data).to(self.device)
 
-    def encode(self, frames: Frames) -> Particles:
-        """The state from which to simulate."""
-        return self.subsampled(self.encode_all(frames))
-
     @torch.no_grad()
-    def encode_all(self, frames: Frames) -> Particles:
-        """All particles of ``frames``."""
+    def encode(self, frames: Frames) -> Particles:
+        """Encodes ``frames`` to particles."""
         with self.setting.precision("encoder", self.device.type):
             return self.simulator.encode(frames)
 
     @torch.no_grad()
     def subsampled(self, particles: Particles) -> Particles:
-        """What of :meth:`encode_all` is simulated."""
+        """Initial state of a rollout from the output of :meth:`encode`."""
         return self.simulator._prepare(self.setting.retained(particles), self.plan)
 
     @torch.no_grad()
     def steps(self, state: Particles, n_steps: int, log: RestLog | None = None) -> list[Particles]:
-        """The newest step of every scene, ``n_steps`` times. ``log`` counts sleeping particles."""
+        """Particles of each of ``n_steps`` predicted steps. ``log`` counts sleeping particles."""
         with self.setting.precision("dynamics", self.device.type):
             return self.simulator.rollout(state, n_steps, self.plan, log=log)
 
     def span(self, n_steps: int) -> int:
-        """Steps that must be timed together, of ``n_steps`` that can be."""
+        """Number of steps that are timed as one call, at most ``n_steps``."""
         config = self.simulator.config.dynamics
         if self.setting.sleep is not None:
-            return n_steps  # no particle sleeps in a first step
+            return n_steps  # particles fall asleep only after several steps
         needs_more = self.setting.captured or config.is_asymmetric
         return max(config.steps_per_call, min(n_steps, TOGETHER) if needs_more else 1)
 
     @torch.no_grad()
     def images(self, particles: Particles, cameras: Cameras) -> Tensor:
-        """[I, H, W, 3] in [0, 1] of the particles of a step."""
+        """Renders ``particles``: [I, H, W, 3] in [0, 1]."""
         return draw(self.simulator, particles, cameras, None, self.plan).color.float().clamp(0, 1)
 
     @property
     def draws_in_graph(self) -> bool:
-        """Whether a graph of the rollout can draw as well: all particles, in the precision of the dynamics."""
-        return (
-            self.simulator.draws_in_graphs
-            and not self.setting.least_opacity
-            and self.setting.renderer == self.setting.dynamics
-        )
+        """Whether a CUDA graph of the rollout includes rendering: all Gaussians, in the precision of the dynamics."""
+        setting = self.setting
+        same = setting.renderer == setting.dynamics and not setting.least_opacity
+        return same and self.simulator.draws_in_graphs
 
     def captured(self, state: Particles, n_steps: int, cameras: Cameras) -> CapturedRollout:
-        """The rollout of ``state`` as a graph, in the precision of the dynamics; it draws where it can."""
+        """Captures the rollout of ``state``, with rendering if :attr:`draws_in_graph`, as a CUDA graph."""
         drawn = cameras if self.draws_in_graph else None
         with self.setting.precision("dynamics", self.device.type):
             return CapturedRollout(
@@ -115,7 +109,7 @@ class Runner:
 
 
 def _changed(simulator: Simulator, setting: Setting) -> Simulator:
-    """A simulator of the same weights, run as ``setting`` says."""
+    """Returns a simulator with the same weights and the configuration of ``setting``."""
     config = setting.of_model(simulator.config)
     if config == simulator.config:
         other = copy.copy(simulator)
@@ -128,19 +122,16 @@ def _changed(simulator: Simulator, setting: Setting) -> Simulator:
     return other
 
 
-# ---- which settings there are ----
-
-
 @dataclass(frozen=True)
 class Group:
-    """Settings that change one thing.
+    """Settings that vary one quantity.
 
     Attributes:
-        name: of the thing.
-        kind: a key of KINDS.
-        settings: of a case; empty where its model or device has none.
-        needs: what must be there for any.
-        few: how many a quick report takes: the last one, both ends, or what is evenly between them too.
+        name: name of the quantity.
+        kind: key of KINDS.
+        settings: case -> settings; empty if the model or device does not support any.
+        needs: requirement for a non-empty list.
+        few: number of settings in a quick report, evenly spaced over the list and including its last one.
     """
 
     name: str
@@ -155,16 +146,12 @@ def _precisions(case: BenchmarkCase) -> list[Setting]:
         return []
     whole = [Setting(p, p, p) for p in PRECISIONS[1:]]
     encoder, dynamics, renderer = (Setting(**{part: "bf16"}) for part in PARTS)
-    return [whole[0], encoder, renderer, dynamics, whole[2], whole[1]]  # tf32, bf16 of the dynamics, and bf16 if few
-
-
-def _powers_below(limit: int, least: int = 1) -> list[int]:
-    return [n for n in (2**k for k in range(20)) if least <= n < limit]
+    return [whole[0], encoder, renderer, dynamics, whole[2], whole[1]]  # of 3: tf32, bf16 dynamics, bf16
 
 
 def _histories(case: BenchmarkCase) -> list[Setting]:
-    most = min(case.restored.data.history, case.restored.plan.history)
-    return [Setting(history=n) for n in _powers_below(most)]
+    trained = min(case.restored.data.history, case.restored.plan.history)
+    return [Setting(history=n) for n in POWERS if n < trained]
 
 
 def _backgrounds(case: BenchmarkCase) -> list[Setting]:
@@ -174,7 +161,7 @@ def _backgrounds(case: BenchmarkCase) -> list[Setting]:
 
 def _patches(case: BenchmarkCase) -> list[Setting]:
     largest = max(case.restored.simulator.config.dynamics.patch_sizes)
-    return [Setting(patch_size=n) for n in reversed(_powers_below(largest, 32)[-3:])]
+    return [Setting(patch_size=n) for n in reversed([n for n in POWERS if 32 <= n < largest][-3:])]
 
 
 def _views(case: BenchmarkCase) -> list[Setting]:
@@ -186,7 +173,7 @@ GROUPS = (
     Group("graph capture", "exact", lambda case: [Setting(captured=True)] * (case.device.type == "cuda"), "a GPU"),
     Group("context views", "model", _views, "more than one context view"),
     Group("history", "model", _histories, "a model of more than one step of history"),
-    Group("background", "model", _backgrounds, "particles of a background"),
+    Group("background", "model", _backgrounds, "background particles"),
     Group("particles kept", "model", lambda case: [Setting(kept=share) for share in (0.75, 0.5, 0.25, 0.1)]),
     Group(
         "degree of colours",

@@ -1,4 +1,4 @@
-"""Runs settings on a benchmark case: first how wrong each is, then what it costs. Failures are results too."""
+"""Measures settings on a benchmark case: first their errors, then their times. A setting may fail."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ import math
 import random
 import statistics
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import torch
@@ -21,49 +20,37 @@ from gsim3d.cameras import Cameras, Frames
 from gsim3d.data import Scene
 from gsim3d.dynamics import RestLog, last_steps
 from gsim3d.errors import CaptureError, InputError, NumericalError
-from gsim3d.evaluate.metrics import PSNR_CAP, mean_of_counted, psnr
+from gsim3d.evaluate.metrics import mean_of_counted, psnr
 from gsim3d.evaluate.perceptual.fvd import MIN_CLIPS, frechet_distance
 from gsim3d.evaluate.protocol import default_views, horizon
 from gsim3d.evaluate.report import write_json
 from gsim3d.evaluate.scoring import METRICS, PLAIN_METRICS, SceneScores, SceneTruth
 from gsim3d.io.files import MAX_TEXT, read_file
+from gsim3d.io.machine import machine
 from gsim3d.io.plain import parse_json
 from gsim3d.io.settings import from_dict
 from gsim3d.numerics.speed import Setting
 from gsim3d.profile.settings import GROUPS, Group, Runner
-from gsim3d.profile.timing import (
-    GAPS,
-    SECTIONS,
-    DeviceClock,
-    GraphStopwatch,
-    Stopwatch,
-    Timing,
-    machine,
-    medians_of,
-    time_call,
-    watched,
-)  # fmt: skip
+from gsim3d.profile.timing import GAPS, DeviceClock, GraphStopwatch, Stopwatch, Timing, medians_of, time_call, watched
 from gsim3d.state import DYNAMIC, Particles
 from gsim3d.train.restore import Restored
 
-MOST_KEPT = 8  # encoded scenes
-COMPARE, ROUNDS, PRESETS, REST = 0.4, 0.6, 0.8, 0.9  # shares of a time limit after which no more of a part is begun
+MAX_CACHED = 8  # encoded scenes kept in memory
+COMPARE, ROUNDS, PRESETS, REST = 0.4, 0.6, 0.8, 0.9  # fractions of the time limit after which each phase starts no more
 NO_TIME = "no time left"
-
-
-# ---- what is measured, and how long ----
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How long to measure.
+    """Number of measurements.
 
     Attributes:
-        n_rounds: times that all settings are timed, each in another order; at least 3 tell differences from noise.
-        repeats: steps that are timed in each round, and encodings of the input.
-        warm_up: calls in each round that do not count.
-        n_steps, n_scenes: of the rollouts that are compared; None: all.
-        few: whether groups take as few settings as they say.
+        n_rounds: passes over all settings, each in a different order; at least 3 separate differences from noise.
+        repeats: timed steps and timed encodings in each round.
+        warm_up: untimed calls in each round.
+        n_steps: predicted steps that are compared; None: all.
+        n_scenes: scenes that are compared; None: all.
+        few: limits each group to its ``Group.few`` settings.
     """
 
     n_rounds: int = 3
@@ -79,23 +66,25 @@ FULL = Effort(repeats=10, n_scenes=16)
 
 
 class TimeLimit:
-    """Seconds that may be used from now on; None: as many as it takes."""
+    """A budget of ``seconds`` from now on; None: unlimited."""
 
     def __init__(self, seconds: float | None = None, now: Callable[[], float] = time.monotonic):
         self._seconds, self._now, self._start = seconds or math.inf, now, now()
 
     def is_over(self, share: float) -> bool:
-        """Whether ``share`` of the time is used."""
+        """Whether this fraction of the budget is used."""
         return self._now() - self._start >= share * self._seconds
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How near a setting is to the reference run.
+    """Agreement of a setting with the reference run.
 
     Attributes:
-        psnr, psnr_worst: dB of the images, mean and worst.
-        position_mean, position_max: of moving particles, in cells, over all steps; None where they are others.
+        psnr: mean PSNR of the images in dB.
+        psnr_worst: lowest PSNR of an image in dB.
+        position_mean: mean distance of moving particles over all steps, in cells; None if the particle sets differ.
+        position_max: largest such distance.
     """
 
     psnr: float
@@ -106,19 +95,21 @@ class Agreement:
 
 @dataclass(eq=False)
 class Point:
-    """One setting and all that was measured of it.
+    """A setting and its measurements.
 
     Attributes:
-        setting: how the simulator is run.
-        group, kind: of the setting.
-        failure: why there is no result; "" where there is one.
-        agreement: with the reference.
-        task: metric -> error against the video, the mean over steps of the mean over scenes.
-        by_step: metric -> its value at each step.
-        encode, step: timings of the input's encoding, and of one simulated step and its images; one a round.
-        once: seconds before the first step (capture of a graph).
-        peak: bytes of the GPU that a step takes beside the model and its input; 0 on a CPU.
-        resting: share of the particles that slept.
+        setting: how the simulator runs.
+        group: name of its group.
+        kind: key of KINDS.
+        failure: reason why there is no result, or "".
+        agreement: agreement with the reference run.
+        task: metric -> score against the video: mean over scenes, then over steps.
+        by_step: metric -> score at each step.
+        encode: timings of the encoding of the input, one a round.
+        step: timings of one simulated step with its images, one a round.
+        once: seconds of the graph capture before the first step.
+        peak: GPU memory in bytes that a step allocates on top of model and input; 0 on a CPU.
+        resting: fraction of sleeping particles.
     """
 
     setting: Setting
@@ -136,12 +127,12 @@ class Point:
 
     @property
     def step_seconds(self) -> float:
-        """The median over all rounds."""
+        """Median seconds of a step over all rounds."""
         return statistics.median(seconds for timing in self.step for seconds in timing.repeats)
 
     @property
     def spread(self) -> float:
-        """Seconds by which two measurements of it differ: its slowest and its fastest round, or halves of a round."""
+        """Seconds between the medians of the slowest and fastest round, or of the halves of a single round."""
         parts = [timing.repeats for timing in self.step]
         if len(parts) == 1:
             half = len(parts[0]) // 2
@@ -150,17 +141,20 @@ class Point:
         return max(medians) - min(medians)
 
     def sections(self) -> dict[str, float]:
-        """Seconds of a step by section: medians over rounds in which they were watched."""
+        """Section -> seconds of a step: medians over the rounds that recorded sections."""
         return medians_of([timing.sections for timing in self.step if timing.sections])
 
 
 def tie(a: Point, b: Point) -> bool:
-    """Whether the times of two points are nearer than two measurements of one thing."""
+    """Whether the step times of two points differ by less than the spread of their measurements."""
     return abs(a.step_seconds - b.step_seconds) < max(a.spread, b.spread)
 
 
 def front(points: Sequence[Point], error: Callable[[Point], float | None]) -> list[Point]:
-    """Those that no other point beats in both time and error, fastest first."""
+    """Returns the Pareto front of ``points`` in step time and ``error``, sorted by step time.
+
+    Points that failed or have no error (None) are left out.
+    """
     best, chosen = math.inf, []
     usable = [p for p in points if not p.failure and error(p) is not None]
     for point in sorted(usable, key=lambda p: (p.step_seconds, error(p))):
@@ -170,26 +164,19 @@ def front(points: Sequence[Point], error: Callable[[Point], float | None]) -> li
     return chosen
 
 
-def disagreement(point: Point) -> float | None:
-    """Root mean squared error of images against the reference's, from the agreement's PSNR."""
-    return None if point.agreement is None else 10 ** (-min(point.agreement.psnr, PSNR_CAP) / 20)
-
-
-# ---- the case ----
-
-
-class Failed(Exception):
-    """A setting has no result; the message says why."""
+def reason(error: Exception) -> str:
+    """The text of a report for the error of a setting."""
+    return "out of memory" if isinstance(error, torch.OutOfMemoryError) else str(error)
 
 
 @dataclass(frozen=True)
 class Rollout:
-    """One predicted scene.
+    """A predicted scene of S steps and V views.
 
     Attributes:
-        images: of each step [S, V, H, W, 3].
-        moving: positions of moving particles at each step [n, 3].
-        resting: share of the particles that slept.
+        images: [S, V, H, W, 3] in [0, 1].
+        moving: S tensors [n, 3], positions of the moving particles.
+        resting: fraction of sleeping particles.
     """
 
     images: Tensor
@@ -198,18 +185,18 @@ class Rollout:
 
 
 class BenchmarkCase:
-    """A trained simulator, scenes that it has not seen, and its reference run on them.
+    """A trained simulator, held-out scenes, and the reference run on them.
 
     Args:
-        restored: the simulator.
-        scenes: with the same cameras.
-        n_steps: to predict; default to the end of the shortest video.
-        metrics: of the error against the video, as :func:`gsim3d.evaluate.scoring.measurable` gives them.
+        restored: trained simulator.
+        scenes: scenes with the same cameras.
+        n_steps: predicted steps; None: to the end of the shortest video.
+        metrics: scores against the video, from :func:`gsim3d.evaluate.scoring.measurable`.
     Raises:
         InputError: scenes do not fit the model.
 
     Attributes:
-        not_measured: metric -> why it has no value.
+        not_measured: metric -> reason why it has no value.
     """
 
     def __init__(
@@ -228,32 +215,30 @@ class BenchmarkCase:
         self.n_steps = min(self.n_steps, n_steps or self.n_steps)
         self.not_measured: dict[str, str] = {}
         self._runners: dict[Setting, Runner] = {}
-        self._encoded: OrderedDict[tuple[Setting, int], Particles] = OrderedDict()
+        self._encoded = lru_cache(MAX_CACHED)(self._encode)
 
     def runner(self, setting: Setting = Setting()) -> Runner:
-        """The simulator under ``setting``, made once."""
+        """Returns the cached simulator of ``setting``."""
         if setting not in self._runners:
             self._runners[setting] = Runner(self.restored, setting)
         return self._runners[setting]
 
     def frames(self, runner: Runner, numbers: Sequence[int]) -> Frames:
-        """What ``runner`` encodes of scenes."""
+        """Input frames of the scenes with these indices."""
         return runner.frames([self.scenes[n] for n in numbers], [self.views[n][0] for n in numbers])
 
     def start(self, runner: Runner, numbers: Sequence[int]) -> Particles:
-        """The encoded state of scenes, as ``runner`` simulates it. The last few scenes are kept."""
+        """Initial state of the scenes for ``runner``. Recent encodings of single scenes are cached."""
         if len(numbers) > 1:
-            return runner.encode(self.frames(runner, numbers))
-        key = runner.setting.of_input, numbers[0]
-        if key not in self._encoded:
-            self._encoded[key] = runner.encode_all(self.frames(runner, numbers))
-            while len(self._encoded) > MOST_KEPT:
-                self._encoded.popitem(last=False)
-        self._encoded.move_to_end(key)
-        return runner.subsampled(self._encoded[key])
+            return runner.subsampled(runner.encode(self.frames(runner, numbers)))
+        return runner.subsampled(self._encoded(runner.setting.of_input, numbers[0]))
+
+    def _encode(self, given: Setting, number: int) -> Particles:
+        runner = self.runner(given)
+        return runner.encode(self.frames(runner, [number]))
 
     def cameras(self, numbers: Sequence[int], step: int) -> Cameras:
-        """The target views of scenes at predicted step ``step``, counted from 0."""
+        """Target cameras of the scenes at predicted step ``step`` (from 0)."""
         parts = [self.scenes[n].cameras_at(list(self.views[n][1]), [self.first + step]) for n in numbers]
         names = ("viewmats", "Ks", "near", "far")
         tensors = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
@@ -261,36 +246,36 @@ class BenchmarkCase:
         return dataclasses.replace(parts[0], image_cloud=clouds, **tensors).to(self.device)
 
     def predict(self, setting: Setting, number: int) -> Rollout:
-        """The whole horizon of one scene. Raises Failed: memory ran out, or a number is not finite."""
+        """Predicts all steps of one scene.
+
+        Raises:
+            NumericalError: particles or images are not finite.
+            InputError: the model does not support the setting.
+        """
         runner, log = self.runner(setting), RestLog()
         images, moving = [], []
-        try:
-            for step, newest in enumerate(runner.steps(self.start(runner, [number]), self.n_steps, log)):
-                if not newest.means.isfinite().all():
-                    raise Failed(f"particles are not finite at step {step + 1}")
-                image = runner.images(newest, self.cameras([number], step))
-                if not image.isfinite().all():
-                    raise Failed(f"images are not finite at step {step + 1}")
-                images.append(image)
-                moving.append(newest.means[newest.activity == DYNAMIC])
-        except torch.OutOfMemoryError:
-            raise Failed("out of memory") from None
-        except (NumericalError, InputError) as error:
-            raise Failed(str(error)) from None
+        for step, newest in enumerate(runner.steps(self.start(runner, [number]), self.n_steps, log)):
+            if not newest.means.isfinite().all():
+                raise NumericalError(f"particles are not finite at step {step + 1}")
+            image = runner.images(newest, self.cameras([number], step))
+            if not image.isfinite().all():
+                raise NumericalError(f"images are not finite at step {step + 1}")
+            images.append(image)
+            moving.append(newest.means[newest.activity == DYNAMIC])
         return Rollout(torch.stack(images), moving, log.resting_share)
 
     def newest(self, number: int) -> Particles:
-        """The last encoded step of a scene, in the reference run."""
+        """Particles of the last encoded step of a scene in the reference run."""
         return last_steps(self.start(self.runner(), [number]), 1)
 
     @cached_property
     def reference(self) -> list[Rollout]:
-        """The reference's rollout of each scene."""
+        """Reference rollout of each scene."""
         return [self.predict(Setting(), number) for number in range(len(self.scenes))]
 
     @cached_property
     def truths(self) -> list[SceneTruth]:
-        """What each scene's rollout is compared with."""
+        """Ground truth of each scene."""
         found, steps = [], range(self.first, self.first + self.n_steps)
         for scene, (_, targets) in zip(self.scenes, self.views, strict=True):
             images = scene.images(list(targets), steps).permute(0, 1, 3, 4, 2).to(self.device).float() / 255
@@ -303,7 +288,7 @@ class BenchmarkCase:
 
     @cached_property
     def constant(self) -> dict[str, list[float | None]]:
-        """Scores by step of the last encoded particles, held still."""
+        """Metric -> score at each step of the constant baseline, which repeats the last encoded particles."""
         runner, scores = self.runner(), []
         for number, truth in enumerate(self.truths):
             newest = self.newest(number)
@@ -312,7 +297,7 @@ class BenchmarkCase:
         return _means(scores)[1]
 
     def compare(self, point: Point) -> None:
-        """Fills in how wrong ``point`` is, against the reference and against the video, or why it has no result."""
+        """Sets the errors of ``point`` against the reference and the video, or its ``failure``."""
         cell = self.restored.simulator.config.dynamics.grid_size
         scores, differences, distances, resting = [], [], [], []
         try:
@@ -322,35 +307,29 @@ class BenchmarkCase:
                 distances.append(_distances(found, reference, cell))
                 scores.append(truth.score([("", found.images)]))
                 resting.append(found.resting)
-        except Failed as error:
-            point.failure = str(error)
+        except (torch.OutOfMemoryError, NumericalError, InputError) as error:
+            point.failure = reason(error)
             return
-        images, positions = torch.cat(differences), None
-        if all(distance is not None for distance in distances):
-            positions = torch.cat(distances)
-        known = positions is not None and len(positions)
-        point.agreement = Agreement(
-            float(images.mean()),
-            float(images.min()),
-            float(positions.mean()) if known else None,
-            float(positions.max()) if known else None,
-        )
+        images, mean, largest = torch.cat(differences), None, None
+        if all(distance is not None for distance in distances) and len(positions := torch.cat(distances)):
+            mean, largest = float(positions.mean()), float(positions.max())
+        point.agreement = Agreement(float(images.mean()), float(images.min()), mean, largest)
         point.task, point.by_step = _means(scores)
         point.resting = statistics.fmean(resting)
 
     @property
     def metric(self) -> str:
-        """The metric of the gain: PSNR without background, where scenes have masks."""
+        """Metric of the gain: "psnr_masked" if the scenes have masks, else "psnr"."""
         return "psnr_masked" if "psnr_masked" in self.constant else "psnr"
 
     def gain(self, point: Point) -> float | None:
-        """How many dB better than particles held still, the mean over steps."""
+        """PSNR above the constant baseline in dB, mean over steps."""
         pairs = zip(point.by_step[self.metric], self.constant[self.metric], strict=True)
         gains = [ours - constant for ours, constant in pairs if ours is not None and constant is not None]
         return statistics.fmean(gains) if gains else None
 
     def share_kept(self, point: Point, reference: Point) -> float | None:
-        """Share of the reference's gain that ``point`` keeps: 1 less what it loses."""
+        """Fraction of the gain of ``reference`` that ``point`` retains; None if there is no gain to compare."""
         if not point.by_step or not reference.by_step:
             return None
         whole, kept = self.gain(reference), self.gain(point)
@@ -358,7 +337,7 @@ class BenchmarkCase:
 
 
 def _distances(found: Rollout, reference: Rollout, cell: float) -> Tensor | None:
-    """Of every moving particle at every step, in cells; None where the two have other particles."""
+    """Distances of moving particles between two rollouts, in cells [S * n], or None if the particle sets differ."""
     pairs = list(zip(found.moving, reference.moving, strict=True))
     if any(a.shape != b.shape for a, b in pairs):
         return None
@@ -366,7 +345,7 @@ def _distances(found: Rollout, reference: Rollout, cell: float) -> Tensor | None
 
 
 def _means(scores: Sequence[SceneScores]) -> tuple[dict[str, float | None], dict[str, list[float | None]]]:
-    """Means over scenes, then over steps, FVD of all clips; and means over scenes by step."""
+    """Scores averaged over scenes and steps (FVD: over all clips), and scores averaged over scenes at each step."""
     values = [score.values[""] for score in scores]
     by_step = {name: torch.stack([s[name] for s in values]).nanmean(0) for name in values[0] if METRICS[name].by_step}
     whole = {name: mean_of_counted(steps) for name, steps in by_step.items()}
@@ -376,23 +355,22 @@ def _means(scores: Sequence[SceneScores]) -> tuple[dict[str, float | None], dict
     return whole, {name: [None if v != v else v for v in steps.tolist()] for name, steps in by_step.items()}
 
 
-# ---- the sweep ----
-
-
 class Stepping:
-    """Simulates and draws ``span`` steps of a setting when called, always from the same state, and waits for a graph.
+    """A callable that simulates and renders ``span`` steps from the same initial state.
 
     Args:
-        case, setting: what is run.
-        clock: of its device.
-        numbers: scenes that are simulated together.
-        span: steps of a call; None: as many as must be timed together.
-        stopwatch: follows the sections of every call; one of a graph makes its marks a part of the graph.
+        case: simulator and scenes.
+        setting: how to run it; ``setting.captured`` captures a CUDA graph here.
+        clock: clock of the device.
+        numbers: indices of the scenes of the batch.
+        span: steps a call; None: :meth:`Runner.span`.
+        stopwatch: records the sections of every call; a GraphStopwatch is captured into the graph.
     Raises:
-        CaptureError, InputError: the setting cannot be captured.
+        CaptureError: the graph cannot be captured.
+        InputError: the model does not support the setting.
 
     Attributes:
-        once: seconds that the capture took.
+        once: seconds of the capture.
     """
 
     def __init__(
@@ -433,13 +411,15 @@ class Stepping:
 
 
 class Sweep:
-    """Measures settings on a case: first how wrong each is, then, of those that have a result, what they cost.
+    """Measures settings on a case: first the errors of all settings, then the times of those that did not fail.
 
     Args:
-        case, effort: what to measure, and how long.
-        limit: once a part of it is over, less is measured, but one round of whatever was compared.
-        progress: is called with what is being done.
-        file: keeps what was measured, so that a sweep that was ended goes on there; None: nothing is kept.
+        case: simulator and scenes.
+        effort: number of measurements.
+        limit: time budget. If it runs short, settings and rounds are skipped; every compared setting gets one round.
+        progress: called with a description of each measurement.
+        file: JSON file of the results, from which an interrupted sweep continues; None: results are not saved.
+        clock: clock of the device; None: a :class:`DeviceClock`.
     """
 
     def __init__(
@@ -457,7 +437,7 @@ class Sweep:
         self._points = self._load() if file is not None and file.is_file() else {}
 
     def points(self, groups: Sequence[Group] = GROUPS) -> tuple[list[Point], dict[str, str]]:
-        """The reference and every setting of ``groups`` that this case has; and what the other groups need."""
+        """Returns points of the reference and all settings of ``groups``, and group -> requirement of empty groups."""
         points, missing = [self.point(Setting(), "reference", "exact")], {}
         for group in groups:
             found = group.settings(self.case)
@@ -467,19 +447,19 @@ class Sweep:
                 apart = (len(found) - 1) / max(1, group.few - 1)
                 found = [found[-1 - int(n * apart)] for n in reversed(range(group.few))]
             for setting in found:
-                if self.case.device.type == "cuda" and setting.sleep is None:  # else it waits for the host
+                if self.case.device.type == "cuda" and setting.sleep is None:  # sleep needs a sync
                     setting = dataclasses.replace(setting, captured=True)
                 points.append(self.point(setting, group.name, group.kind))
         return points, missing
 
     def point(self, setting: Setting, group: str, kind: str) -> Point:
-        """That of ``setting``, with what was measured of it before."""
+        """Returns the point of ``setting``, with its earlier measurements."""
         return self._points.setdefault(setting, Point(setting, group, kind))
 
     def run(self, points: Sequence[Point]) -> None:
-        """Fills in ``points``."""
+        """Measures ``points`` in place."""
         for point in sorted(points, key=lambda p: repr(p.setting.of_input) != repr(Setting())):
-            self.progress(f"error: {point.setting.name}")
+            self.progress(f"errors: {point.setting.name}")
             if point.agreement is None and not point.failure:
                 if self.limit.is_over(COMPARE) and point.setting != Setting():
                     point.failure = NO_TIME
@@ -494,43 +474,40 @@ class Sweep:
             order = list(points)
             random.Random(n).shuffle(order)
             for point in order:
-                self.progress(f"time, round {n + 1}: {point.setting.name}")
+                self.progress(f"timing, round {n + 1}: {point.setting.name}")
                 if not point.failure and len(point.step) <= n:
                     self._time(point)
             self._time_inputs([point for point in points if not point.failure and len(point.encode) <= n])
             self._save()
 
     def _time_inputs(self, points: Sequence[Point]) -> None:
-        """One round of each input; equal ones are encoded once."""
+        """Times one round of encodings; settings with equal inputs share a timing."""
         for given in dict.fromkeys(point.setting.of_input for point in points):
             runner = self.case.runner(given)
             frames = self.case.frames(runner, [0])
             repeats = self.effort.repeats if given == Setting() else 1 + self.effort.repeats // 3
-            timing = time_call(lambda: runner.encode_all(frames), self.clock, repeats, self.effort.warm_up)
+            timing = time_call(lambda: runner.encode(frames), self.clock, repeats, self.effort.warm_up)
             for point in points:
                 if point.setting.of_input == given:
                     point.encode += (timing,)
 
     def _time(self, point: Point) -> None:
-        """One round of one point, or why it cannot be."""
+        """Times one round of ``point``, or sets its ``failure``."""
         try:
             timing = self._timing(point)
-        except torch.OutOfMemoryError:
-            point.failure = "out of memory while timed"
-        except (CaptureError, InputError) as error:
-            point.failure = str(error)
+        except (torch.OutOfMemoryError, CaptureError, InputError) as error:
+            point.failure = f"timing: {reason(error)}"
         else:
             point.step += (timing,)
 
     def _timing(self, point: Point) -> Timing:
         case, setting, effort = self.case, point.setting, self.effort
-        span = case.runner(setting).span(case.n_steps)
         if case.device.type == "cpu":
             stopwatch = Stopwatch(self.clock)
             stepping = Stepping(case, setting, self.clock, stopwatch=stopwatch)
-            repeats = max(2, math.ceil(effort.repeats / span))
+            repeats = max(2, math.ceil(effort.repeats / stepping.span))
             timing = time_call(stepping, self.clock, repeats, effort.warm_up, lambda: stopwatch.seconds)
-            return timing.split_over(span)
+            return timing.split_over(stepping.span)
         free, total = torch.cuda.mem_get_info(case.device)
         if free < total / 2:
             self._graphs.clear()
@@ -543,12 +520,12 @@ class Sweep:
         point.peak = max(point.peak, torch.cuda.max_memory_allocated(case.device) - before)
         if not point.step and setting.sleep is None:
             timing = Timing(timing.repeats, self.sections_of_graph(setting, timing))
-        return timing.split_over(span)
+        return timing.split_over(stepping.span)
 
     def sections_of_graph(self, setting: Setting, timing: Timing) -> dict[str, float]:
-        """Medians of a call, from a graph of its own, since marks are a part of it.
+        """Section -> median seconds of a call, measured on a separate graph with events.
 
-        Where ``timing`` is of calls that the host launches, the GPU does the same and waits for the host in the rest.
+        If ``timing`` is of a setting without a graph, the time above the sum of sections counts as GAPS.
         """
         stopwatch, span = GraphStopwatch(self.clock), self.case.runner(setting).span(self.case.n_steps)
         captured = dataclasses.replace(setting, captured=True)
@@ -559,10 +536,21 @@ class Sweep:
         sections = time_call(marked, self.clock, len(timing.repeats), 1, lambda: stopwatch.seconds).sections
         if not setting.captured:
             sections[GAPS] = max(0.0, timing.median - sum(sections.values()))
-        return {name: sections[name] for name in SECTIONS if name in sections}
+        return sections
+
+    def throughput(self, point: Point, n_scenes: int) -> dict:
+        """Simulated steps a second of a batch of ``n_scenes`` with images, or the problem of the measurement."""
+        setting, found = point.setting, {"setting": point.setting.name, "scenes": n_scenes, "steps_a_second": None}
+        numbers = [n % len(self.case.scenes) for n in range(n_scenes)]
+        try:
+            stepping = Stepping(self.case, setting, self.clock, numbers, None if setting.captured else 1)
+            timing = time_call(stepping, self.clock, self.effort.repeats, self.effort.warm_up)
+        except (torch.OutOfMemoryError, CaptureError, InputError) as error:
+            return found | {"problem": reason(error)}
+        return found | {"steps_a_second": n_scenes * stepping.span / timing.median, "problem": ""}
 
     def _conditions(self) -> dict:
-        """What must be the same for numbers of before to hold."""
+        """Facts that must be equal for saved measurements to be reused."""
         case, facts = self.case, machine(self.case.device)
         names = ("device", "processor", "sources", "torch")
         return {
@@ -583,6 +571,6 @@ class Sweep:
         try:
             content = parse_json(read_file(self._file, MAX_TEXT))
             points = [from_dict(Point, values, f"{self._file}: ") for values in content.pop("points")]
-        except (ValueError, AttributeError, KeyError, TypeError):  # of another version: nothing but time is lost
+        except (ValueError, AttributeError, KeyError, TypeError):  # written by another version
             return {}
         return {point.setting: point for point in points} if content == self._conditions() else {}

@@ -21,6 +21,7 @@ import numpy as np
 
 from gsim3d.errors import InputError
 from gsim3d.io.files import write_whole
+from gsim3d.io.machine import processor_name
 from gsim3d.io.plain import parse_json
 from gsim3d.synth.cameras import Rig, workspace_origin
 from gsim3d.synth.render import View
@@ -163,7 +164,7 @@ def write_manifest(out: Path, folders: list[Path], settings: dict) -> dict:
     manifest = {
         "generator_version": GENERATOR_VERSION,
         "settings": settings,
-        "machine": {"processor": _processor(), "system": platform.platform(), "python": platform.python_version()},
+        "machine": {"processor": processor_name(), "system": platform.platform(), "python": platform.python_version()},
         "versions": {package: _version(package) for package in PACKAGES},
         "rejected": rejected_draws(folders),
         "scenes": scenes,
@@ -182,11 +183,3 @@ def _version(package: str) -> str:
         return version(package)
     except PackageNotFoundError:
         return "absent"
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())

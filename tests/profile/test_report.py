@@ -60,7 +60,7 @@ def test_page_needs_nothing_from_elsewhere(written):
     assert not re.findall(r"(?:src|href)=['\"](?!data:)", page) and "<script" not in page
     assert "gsim3d profile &lt;x&gt;" in page and "failed: out of memory" in page
     assert "precision: needs a GPU &lt;sic&gt;" in page and "fvd: run gsim3d weights fvd" in page
-    assert "111 steps a second of 4 scenes together" in page and "<li>fast: history 1" in page
+    assert "111 steps a second in a batch of 4 scenes" in page and "<li>fast: history 1" in page
 
 
 def test_kept_is_the_share_of_the_gain(written):
@@ -85,7 +85,7 @@ def test_table_names_failures_and_ties(written):
     lines = report.table(content).splitlines()
     assert lines[1].startswith("reference") and "1.00" in lines[1] and "100.00%" in lines[1]
     assert "tie" in lines[3] and lines[4].split() == ["kept", "0.5", "failed"]
-    assert lines[5] == "reference: 111 steps a second of 4 scenes together, with images"
+    assert lines[5] == "reference: 111 steps a second in a batch of 4 scenes, with images"
 
 
 @pytest.fixture
@@ -129,8 +129,8 @@ def test_command_names_what_there_was_no_time_for(arguments, tmp_path):
     content = json.loads((tmp_path / "out" / "report.json").read_text())
     assert [row["name"] for row in content["settings"]] == ["reference"] and content["throughput"] == []
     assert content["not_run"] == {
-        "history": "more time than --minutes gave, for history 1;",
-        "grid size": "more time than --minutes gave, for grid 0.5; grid 2;",
+        "history": "a larger --minutes, for history 1;",
+        "grid size": "a larger --minutes, for grid 0.5; grid 2;",
     }
 
 
@@ -138,7 +138,7 @@ def test_wrong_arguments_are_one_line(capsys, tmp_path):
     arguments = ["profile", str(tmp_path / "none"), "data", "--out", str(tmp_path / "out")]
     for more, message in (
         ([], "none"),
-        (["--settings", "volume"], "'volume' does not exist; settings: 'precision'"),
+        (["--settings", "volume"], "unknown name 'volume'; settings: 'precision'"),
         (["--minutes", "0"], "--minutes: must be a finite number above 0"),
     ):
         assert main([*arguments, *more]) == 2

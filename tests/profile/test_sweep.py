@@ -6,25 +6,22 @@ import pytest
 import torch
 
 from gsim3d.cuda_graphs import CapturedRollout
-from gsim3d.errors import CaptureError
+from gsim3d.errors import CaptureError, NumericalError
 from gsim3d.evaluate.perceptual.fvd import frechet_distance
 from gsim3d.evaluate.protocol import predict, render_steps
 from gsim3d.io.checkpoint import Checkpoint
 from gsim3d.numerics.speed import Setting
 from gsim3d.profile import sweep as sweeping
-from gsim3d.profile.report import throughput
 from gsim3d.profile.settings import Runner
 from gsim3d.profile.sweep import (
     NO_TIME,
     Agreement,
     BenchmarkCase,
     Effort,
-    Failed,
     Point,
     Stepping,
     Sweep,
     TimeLimit,
-    disagreement,
     front,
     tie,
 )  # fmt: skip
@@ -98,7 +95,7 @@ def test_failure_names_the_step_or_the_memory(case, monkeypatch):
         return found
 
     monkeypatch.setattr(Runner, "steps", spoiled)
-    with pytest.raises(Failed, match="particles are not finite at step 2"):
+    with pytest.raises(NumericalError, match="particles are not finite at step 2"):
         case.predict(Setting(history=1), 0)
 
     def full(self, *args):
@@ -132,7 +129,7 @@ def test_rounds_are_timed_in_another_order_each(case):
     sweep = Sweep(case, Effort(n_rounds=3, repeats=2, warm_up=0), progress=said.append)
     points = points_of(sweep, Setting(), Setting(history=1), Setting(kept=0.5))
     sweep.run(points)
-    assert [line.split(": ")[0] for line in said[:3]] == ["error"] * 3  # how wrong it is comes before what it costs
+    assert [line.split(": ")[0] for line in said[:3]] == ["errors"] * 3  # errors are measured before times
     rounds = [[line.split(": ")[1] for line in said[3 + 3 * n : 6 + 3 * n]] for n in range(3)]
     assert len({tuple(r) for r in rounds}) > 1 and all(sorted(r) == sorted(rounds[0]) for r in rounds)
     assert points[0].encode is not points[1].encode and points[0].encode[0] is points[2].encode[0]  # two inputs
@@ -145,7 +142,7 @@ def test_rounds_are_timed_in_another_order_each(case):
 
 def test_front_holds_what_no_point_beats():
     a, b, c, d = timed(1.0, 20.0), timed(2.0, 50.0), timed(3.0, 40.0), timed(0.5, 60.0, failure="out of memory")
-    assert front([a, b, c, d], disagreement) == [a, b]
+    assert front([a, b, c, d], lambda p: -p.agreement.psnr) == [a, b]
 
 
 def test_near_times_are_a_tie():
@@ -249,15 +246,15 @@ def test_throughput_counts_all_scenes_and_steps(case, monkeypatch):
         return call(self, state, cameras)
 
     monkeypatch.setattr(CapturedRollout, "__call__", counted)
-    assert throughput(sweep, timed(1.0, 20.0), n_scenes=3)["steps_a_second"] > 0 and not replays
+    assert sweep.throughput(timed(1.0, 20.0), 3)["steps_a_second"] > 0 and not replays
     captured = sweep.point(Setting(captured=True), "", "exact")
-    assert throughput(sweep, captured, n_scenes=3)["steps_a_second"] > 0
+    assert sweep.throughput(captured, 3)["steps_a_second"] > 0
     assert replays == [(3 * case.restored.data.history, 4)] * 2
 
     def fails(*args, **options):
         raise CaptureError("Captured: no")
 
     monkeypatch.setattr(Runner, "captured", fails)
-    assert throughput(sweep, captured)["problem"] == "Captured: no"
+    assert sweep.throughput(captured, 4)["problem"] == "Captured: no"
     monkeypatch.setattr(sweeping.Stepping, "_run", lambda self: (_ for _ in ()).throw(torch.OutOfMemoryError("")))
-    assert throughput(sweep, timed(1.0, 20.0))["problem"] == "out of memory"
+    assert sweep.throughput(timed(1.0, 20.0), 4)["problem"] == "out of memory"

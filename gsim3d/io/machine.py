@@ -1,0 +1,43 @@
+"""Facts about the machine and the versions, for files that state how they were made."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from pathlib import Path
+
+import torch
+
+import gsim3d
+
+PACKAGE = Path(gsim3d.__file__).parent
+
+
+def machine(device: torch.device) -> dict[str, str]:
+    """Versions, device and processor of a measurement. "sources" is a hash of the package's Python files."""
+    found = {
+        "gsim3d": gsim3d.__version__,
+        "sources": _hash_of_sources(),
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+    }
+    if device.type == "cuda":
+        return found | {"device": torch.cuda.get_device_name(device), "cuda": torch.version.cuda}
+    return found | {"device": f"CPU, {torch.get_num_threads()} threads", "processor": processor_name()}
+
+
+def processor_name() -> str:
+    """Model name of the CPU, or its architecture if the system does not give one."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    names = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.processor() or platform.machine())
+
+
+def _hash_of_sources() -> str:
+    digest = hashlib.sha256()
+    for file in sorted(PACKAGE.rglob("*.py")):
+        digest.update(file.relative_to(PACKAGE).as_posix().encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()[:12]
