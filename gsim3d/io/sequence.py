@@ -76,6 +76,6 @@ def _fps(about: Path) -> float | None:
         fps = json.loads(read_file(about, MAX_TEXT))["fps"]
         if isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 0 < fps < math.inf:
             raise ValueError(f"fps must be a positive number; got {fps!r:.40}")
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        return float(fps)
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise InputError(f"{about}: not the description of a sequence: {error}") from None
-    return float(fps)

@@ -94,11 +94,14 @@ def _read_streams(path: Path, content: bytes) -> Splats:
         if whole != size or begin + packed > len(content):
             raise InputError(f"{path}: stream {index} has {whole} bytes; expected {size} within the file")
         try:
-            part = zstandard.ZstdDecompressor().decompressobj().decompress(content[begin : begin + packed])
+            with zstandard.ZstdDecompressor().stream_reader(content[begin : begin + packed]) as stream:
+                part = stream.read(size + 1)  # a small frame may unpack to much more
         except zstandard.ZstdError as error:
             raise InputError(f"{path}: stream {index} is damaged: {error}") from None
         if len(part) != size:
-            raise InputError(f"{path}: stream {index} holds {len(part)} bytes; expected {size}")
+            raise InputError(
+                f"{path}: stream {index} holds {'more' if len(part) > size else 'fewer'} than {size} bytes"
+            )
         parts.append(part)
         begin += packed
     return _decoded(version, count, degree, bits, parts + [b""] * (6 - n_streams))

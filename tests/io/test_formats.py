@@ -19,6 +19,7 @@ from gsim3d.io.orbit import orbit_frames
 from gsim3d.io.sequence import open_sequence, write_about
 from gsim3d.ops import rasterize_gaussians
 from gsim3d.state import Gaussians
+from tests.io.spz_files import spz_4
 
 WITHOUT_USD = [suffix for suffix in FORMATS if not suffix.startswith(".usd")]
 COUNTS = (1, 255, 256, 257)
@@ -148,24 +149,34 @@ def test_ply_keeps_world_offset_or_warns_when_turned(tmp_path, recwarn):
 
 @pytest.mark.parametrize("degree, streams", [(0, 5), (1, 6)])
 def test_spz_of_version_4_is_read(degree, streams, tmp_path):
-    zstandard = pytest.importorskip("zstandard", reason="zstandard is not installed")
+    pytest.importorskip("zstandard", reason="zstandard is not installed")
     given = make(10, degree)
     write_splats(tmp_path / "three.spz", given)
     content = gzip.decompress((tmp_path / "three.spz").read_bytes())
-    sizes, begin, parts = [90, 10, 30, 30, 40, 90][:streams], 16, []
-    for size in sizes:
-        parts.append(content[begin : begin + size])
-        begin += size
-    packed = [zstandard.ZstdCompressor().compress(part) for part in parts]
-    head = content[:4] + struct.pack("<I", 4) + content[8:15] + struct.pack("<BI", streams, 32) + bytes(12)
-    table = b"".join(struct.pack("<QQ", len(p), len(part)) for p, part in zip(packed, parts, strict=True))
-    (tmp_path / "four.spz").write_bytes(head + table + b"".join(packed))
+    (tmp_path / "four.spz").write_bytes(spz_4(content))
     three, four = read_splats(tmp_path / "three.spz"), read_splats(tmp_path / "four.spz")
     assert all(torch.equal(getattr(three, name), getattr(four, name)) for name in ("means", "quats", "scales", "sh"))
-    wrong = head[:15] + bytes([11 - streams]) + head[16:]
-    (tmp_path / "four.spz").write_bytes(wrong + table + b"".join(packed))
+    (tmp_path / "four.spz").write_bytes(spz_4(content, 11 - streams))
     with pytest.raises(InputError, match="streams"):
         read_splats(tmp_path / "four.spz")
+
+
+def test_spz_of_version_4_that_unpacks_to_too_much_is_refused(tmp_path):
+    zstandard = pytest.importorskip("zstandard", reason="zstandard is not installed")
+    write_splats(tmp_path / "a.spz", make(1, 0))
+    good = spz_4(gzip.decompress((tmp_path / "a.spz").read_bytes()))
+    bomb = zstandard.ZstdCompressor().compress(bytes(2**28))  # 256 MiB in 8 KiB
+    size = struct.unpack_from("<Q", good, 32)[0]
+    (tmp_path / "a.spz").write_bytes(
+        good[:32] + struct.pack("<Q", len(bomb)) + good[40:112] + bomb + good[112 + size :]
+    )
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match="stream 0 holds more than 9 bytes"):
+            read_splats(tmp_path / "a.spz")
+        assert tracemalloc.get_traced_memory()[1] < 2**24
+    finally:
+        tracemalloc.stop()
 
 
 def test_splat_record_by_hand(tmp_path):
@@ -326,9 +337,10 @@ def test_sequence_reads_its_rate(tmp_path):
     write_about(folder, 42.0)
     sequence = open_sequence(tmp_path / "run")
     assert sequence.fps == 42 and len(sequence) == 3 and torch.equal(sequence[2].means, moving(3)[2].means)
-    (folder / "sequence.json").write_text('{"fps": "fast"}')
-    with pytest.raises(InputError, match="sequence.json"):
-        open_sequence(folder)
+    for wrong in ('"fast"', "1" + "0" * 400, "-1"):
+        (folder / "sequence.json").write_text(f'{{"fps": {wrong}}}')
+        with pytest.raises(InputError, match="sequence.json"):
+            open_sequence(folder)
     write_splats(folder / "other.splat", make(2, 0))
     with pytest.raises(InputError, match="several formats"):
         open_sequence(folder)

@@ -2,11 +2,13 @@
 
 import json
 import re
+from pathlib import Path
 
 import pytest
 
 from gsim3d.cli.main import COMMANDS
 from tests.stability.fuzz import commands
+from tests.stability.fuzz.campaign import campaign
 from tests.stability.fuzz.engine import Outcome, make_case, replay, run, targets
 from tests.stability.fuzz.ops import OPS, public_ops
 from tests.stability.fuzz.readers import READERS
@@ -118,6 +120,19 @@ def test_a_kept_input_can_be_run_again(misbehaved):
     answers = [replay(kept)[0] for _ in range(4)]
     # A fresh process is good for three inputs; a replay tells what happens now.
     assert answers == ["ok", "ok", "ok", "ValueError"]
+
+
+def test_a_campaign_goes_on_where_it_was(tmp_path, capsys):
+    assert campaign(["_good"], 4, tmp_path, a_round=3) and not list(tmp_path.glob("_good-*"))
+    assert not campaign(["_good", "_unnamed"], 6, tmp_path, a_round=6)
+    totals = json.loads((tmp_path / "totals.json").read_text())
+    assert {name: total["count"] for name, total in totals.items()} == {"_good": 6, "_unnamed": 6}
+    text, kept = totals["_unnamed"]["failures"][0]
+    assert "does not say what is wrong" in text and (Path(kept) / "case.json").is_file()
+    said = capsys.readouterr().out
+    assert [f"_good: {n} inputs" in said for n in (3, 1, 2, 4)] == [True, True, True, False]
+    assert not campaign(["_good", "_unnamed"], 6, tmp_path)  # failures stay
+    assert re.search(r"all +12 inputs, [1-9]\d* failures", capsys.readouterr().out)
 
 
 def test_inputs_are_a_function_of_seed_and_number(tmp_path):

@@ -266,14 +266,18 @@ def _child(
     # The libraries take their time to load.
     place, since, used = progress.read_bytes(), time.monotonic() + 60, math.inf
     problem = None
-    while child.poll() is None:
-        time.sleep(0.02)
-        if (now := progress.read_bytes()) != place:
-            place, since, used = now, max(since, time.monotonic()), _processor_time(child.pid)
-        elif time.monotonic() - since > WAITING * patience or _processor_time(child.pid) - used > patience:
-            child.kill()
-            child.wait()
-            problem = f"hangs: no answer within {patience:g} s"
+    try:
+        while child.poll() is None:
+            time.sleep(0.02)
+            if (now := progress.read_bytes()) != place:
+                place, since, used = now, max(since, time.monotonic()), _processor_time(child.pid)
+            elif time.monotonic() - since > WAITING * patience or _processor_time(child.pid) - used > patience:
+                child.kill()
+                child.wait()
+                problem = f"hangs: no answer within {patience:g} s"
+    finally:  # also where this process is stopped
+        child.kill()
+        child.wait()
     number, index = PROGRESS.unpack(progress.read_bytes())
     if number == len(jobs):
         return None, number, 0

@@ -6,7 +6,9 @@ import atexit
 import contextlib
 import dataclasses
 import functools
+import gzip
 import hashlib
+import importlib.util
 import io
 import json
 import os
@@ -38,6 +40,7 @@ from gsim3d.evaluate.plan_report import TIMES, load_times
 from gsim3d.evaluate.predictions import Predictions
 from gsim3d.io import checkpoint, read_ply, read_splats, write_ply, write_splats
 from gsim3d.io.files import read_yaml
+from gsim3d.io.sequence import open_sequence, write_about
 from gsim3d.io.settings import from_dict, to_dict
 from gsim3d.numerics.speed import load_speed
 from gsim3d.simulator import Simulator
@@ -52,6 +55,7 @@ from tests.data.made_scenes import WRITERS, edit_json, make_scene
 from tests.data.made_videos import trimmed, with_gaps, write_plain, write_scene as write_videos
 from tests.data.test_colmap import seen_points, write_colmap
 from tests.data.test_transforms import write_synthetic
+from tests.io.spz_files import spz_4
 from tests.io.test_ply import DC, REST, SHAPE, XYZ, rows_of
 from tests.stability.fuzz.engine import LARGE, Failure, Target, finite
 from tests.stability.fuzz.files import damage
@@ -213,6 +217,37 @@ def _read_splats(suffix: str, folder: Path, what: str) -> None:
     finite(read_splats(folder / f"a{suffix}"))
 
 
+def _write_unpacked_spz(folder: Path) -> None:
+    write_splats(folder / "a.spz", _gaussians())
+    (folder / "a.spz").write_bytes(gzip.decompress((folder / "a.spz").read_bytes()))
+
+
+def _read_unpacked_spz(folder: Path, what: str) -> None:
+    """Packs the file after it was damaged: damage that a checksum would find reaches what lies behind it."""
+    file = folder / "a.spz"
+    if file.is_file() and not file.is_symlink() and file.stat().st_size < LARGE:
+        file.write_bytes(gzip.compress(file.read_bytes()))
+    finite(read_splats(file))
+
+
+def _write_spz_4(folder: Path) -> None:
+    write_splats(folder / "a.spz", _gaussians())
+    (folder / "a.spz").write_bytes(spz_4(gzip.decompress((folder / "a.spz").read_bytes())))
+
+
+def _write_sequence(folder: Path) -> None:
+    for step in range(2):
+        write_splats(folder / f"step_{step}.splat", _gaussians())
+    write_about(folder, 24.0)
+
+
+def _read_sequence(folder: Path, what: str) -> None:
+    sequence = open_sequence(folder)
+    if sequence.fps is not None and not 0 < sequence.fps < float("inf"):
+        raise Failure(f"the rate is {sequence.fps}")
+    finite([sequence[frame] for frame in range(len(sequence))])
+
+
 TRAINING = {
     "preset": "tiny",
     "data": {"history": 2, "context_views": 2, "target_only_cameras": [3]},
@@ -369,6 +404,9 @@ READERS = {
         )
         for suffix in (".splat", ".compressed.ply", ".spz", ".glb")
     },
+    "spz_unpacked": Reader(_write_unpacked_spz, _read_unpacked_spz),
+    **({"spz_4": Reader(_write_spz_4, partial(_read_splats, ".spz"))} if importlib.util.find_spec("zstandard") else {}),
+    "sequence": Reader(_write_sequence, _read_sequence, ("sequence.json",), headless=True),
     "ply_lists": Reader(lambda folder: _write_list_ply(folder / "a.ply", "binary_big_endian"), _read_ply),
     "ply_lists_text": Reader(lambda folder: _write_list_ply(folder / "a.ply", "ascii"), _read_ply),
     "meshes": Reader(_write_meshes, _read_meshes),
