@@ -16,7 +16,8 @@ FILE's suffix chooses the format (docs/reference/splat_formats.md has their boun
 examples:
   gsim3d export runs/ball --to ball.usdc                  all predicted frames of gsim3d simulate
   gsim3d export runs/ball --frame -1 --to ball.spz        the last one
-  gsim3d export runs/ball --to ball.mp4 --size 720
+  gsim3d export runs/ball --to ball.mp4 --size 720        a film from an orbiting camera, with the time
+  gsim3d export garden.ply --to orbit.mp4                 once around a single frame, in six seconds
   gsim3d export garden.ply --to garden.splat
 """
 
@@ -33,7 +34,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--up", choices=("y", "z"), help="axis that points up in TARGET (default: as its format says)")
     parser.add_argument("--up-to", choices=("y", "z"), help="the same in FILE (default: as its readers expect)")
     parser.add_argument("--size", type=whole(16, 4096), default=512, metavar="PX", help="of a video (default 512)")
-    parser.add_argument("--turns", type=number(-1e3, 1e3), default=0.25, help="of a video's camera (default 0.25)")
+    turns = "of a video's camera (default 0.25; 1 around a single frame)"
+    parser.add_argument("--turns", type=number(-1e3, 1e3), help=turns)
 
 
 def run(args: argparse.Namespace) -> int:

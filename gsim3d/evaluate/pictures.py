@@ -24,10 +24,9 @@ from gsim3d.io.sequence import write_about
 from gsim3d.io.terminal import progress
 from gsim3d.nn.gaussian_head import render
 from gsim3d.train.restore import Restored
+from gsim3d.viewer.films import film_frames
 from gsim3d.viewer.player import View, write_player
 
-FRAME_SIZE = 256  # pixels; smaller frames are enlarged by a whole factor to at most this height
-GAP = 4  # pixels of white between frames
 SPLAT_SIZE = 320  # pixels, height and width of the picture of the Gaussians
 SPLAT_SHRINK = 0.45  # of their scales there, so that single ones can be distinguished
 CURVES = {  # method -> label, colour
@@ -53,25 +52,6 @@ def true_images(scene: Scene, cams: Sequence[int], steps: Sequence[int]) -> np.n
     if known:
         images[: len(known)] = scene.images(list(cams), known).permute(0, 1, 3, 4, 2).numpy()
     return images
-
-
-def comparison_frames(truth: np.ndarray, predicted: np.ndarray) -> list[np.ndarray]:
-    """Video frames from two [S, V, H, W, 3]: truth above prediction, one column a view; height and width are even."""
-    factor = max(1, FRAME_SIZE // truth.shape[2])
-    frames = []
-    for rows in zip(truth, predicted, strict=True):
-        frame = _grid([[view.repeat(factor, 0).repeat(factor, 1) for view in row] for row in rows])
-        frames.append(frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2])
-    return frames
-
-
-def _grid(rows: list[list[np.ndarray]]) -> np.ndarray:
-    height, width = rows[0][0].shape[:2]
-    canvas = np.full((len(rows) * (height + GAP) - GAP, len(rows[0]) * (width + GAP) - GAP, 3), 255, np.uint8)
-    for i, row in enumerate(rows):
-        for j, image in enumerate(row):
-            canvas[i * (height + GAP) :, j * (width + GAP) :][:height, :width] = image
-    return canvas
 
 
 @torch.no_grad()
@@ -116,7 +96,8 @@ def write_prediction(
         for step, views in enumerate(images):
             for cam, image in zip(cams, views, strict=True):
                 write_picture(part / "frames" / f"cam_{cam}_{step:04d}.png", image)
-        write_video(part / "rollout.mp4", comparison_frames(truth, np.stack(images)), scene.fps)
+        rows = {"truth": truth, "predicted": np.stack(images)}
+        write_video(part / "rollout.mp4", film_frames(rows, scene.fps, prediction.n_encoded), scene.fps)
         write_gaussians(part / "gaussians", restored, prediction, scene.fps)
         if player:
             camera = scene.cameras_at(cams[:1], [first])

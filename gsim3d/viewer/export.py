@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+
+import numpy as np
 
 from gsim3d.errors import InputError
 from gsim3d.io import write_video
@@ -11,9 +14,12 @@ from gsim3d.io.formats import format_of, write_splats
 from gsim3d.io.orbit import orbit_frames
 from gsim3d.io.sequence import open_sequence
 from gsim3d.io.terminal import progress
+from gsim3d.state import Gaussians
+from gsim3d.viewer.films import write_time
 from gsim3d.viewer.player import write_player
 
 FPS = 24.0
+ORBIT = 6.0  # seconds of a video of a single frame
 
 
 def export(
@@ -25,7 +31,7 @@ def export(
     up: str | None = None,
     up_to: str | None = None,
     size: int = 512,
-    turns: float = 0.25,
+    turns: float | None = None,
 ) -> str:
     """Writes the file ``to``, whose suffix is its format; returns one line about what was written.
 
@@ -36,7 +42,7 @@ def export(
         up: "y" or "z", the axis that points up in ``target``; None: as its format says.
         up_to: the same in ``to``.
         size: pixels, width and height of a video.
-        turns: turns of a video's camera around the scene.
+        turns: turns of a video's camera around the scene; None: a quarter, one around a single frame.
     Raises:
         InputError: ``target`` cannot be read, or ``to`` cannot hold it.
     """
@@ -51,7 +57,7 @@ def export(
     if suffix == ".mp4":
         if size % 2:
             raise InputError(f"--size must be even for a video; got {size}")
-        write_video(out, list(orbit_frames(frames, len(chosen), size, turns)), fps)
+        write_video(out, _orbit(list(frames), fps, size, turns), fps)
         what = f"a video of {size}x{size} pixels"
     elif suffix == ".html":
         gaussians = list(frames)
@@ -71,3 +77,14 @@ def export(
             what += f"; colours that depend on the view are not kept by {suffix}"
     rate = f"{len(chosen)} frames, {fps:g} a second, " if len(chosen) > 1 else ""
     return f"{out}: {rate}{what}; {out.stat().st_size / 1e6:.2f} MB"
+
+
+def _orbit(frames: list[Gaussians], fps: float, size: int, turns: float | None) -> Iterator[np.ndarray]:
+    """Images of ``frames`` with their time, or of a single one from all sides."""
+    if len(frames) == 1:
+        frames = frames * max(2, round(ORBIT * fps))
+        yield from orbit_frames(frames, len(frames), size, 1.0 if turns is None else turns)
+        return
+    for step, image in enumerate(orbit_frames(frames, len(frames), size, 0.25 if turns is None else turns)):
+        write_time(image, step, fps)
+        yield image

@@ -16,7 +16,7 @@ from gsim3d.dynamics import concatenate
 from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError
 from gsim3d.evaluate import protocol
-from gsim3d.evaluate.pictures import as_bytes, comparison_frames, splat_picture, true_images, write_curves
+from gsim3d.evaluate.pictures import splat_picture, true_images, write_curves
 from gsim3d.evaluate.protocol import (
     METHODS,
     Prediction,
@@ -297,13 +297,8 @@ def test_values_that_do_not_exist_are_null(tmp_path):
 def test_pictures(restored, scene, device):
     restored = moved_to(device, restored)
     prediction = predict(restored, scene, (0, 2), 6)
-    images = as_bytes(render_steps(restored, prediction.particles, scene, [3, 1]))
     truth = true_images(scene, [3, 1], range(8))
     assert truth[5].any() and not truth[6:].any()  # the scene has six steps
-    frames = comparison_frames(truth, images)
-    assert len(frames) == 8 and frames[0].shape == (516, 516, 3)
-    assert (frames[0][:256, :256] == truth[0, 0].repeat(8, 0).repeat(8, 1)).all()
-    assert (frames[0][260:, 260:] == images[0, 1].repeat(8, 0).repeat(8, 1)).all()
     assert splat_picture(restored, prediction, scene, 3, 1).shape == (320, 320, 3)
 
 

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from gsim3d.data import Scene
-from gsim3d.evaluate.pictures import as_bytes, comparison_frames, true_images
+from gsim3d.evaluate.pictures import as_bytes, true_images
 from gsim3d.evaluate.protocol import default_views, predict, render_steps, score_scenes
 from gsim3d.io import write_video
 from gsim3d.train.restore import Restored, restore
+from gsim3d.viewer.films import film_frames
 
 SHOWN = 3  # trajectories in the video
 METRICS = ("psnr_masked", "psnr_body")
@@ -51,4 +52,5 @@ def write_comparison(path: Path, restored: Restored, scenes: Sequence[Scene]) ->
         prediction = predict(restored, scene, context, n_steps - restored.data.history)
         truth.append(true_images(scene, targets[:1], range(n_steps)))
         predicted.append(as_bytes(render_steps(restored, prediction.particles, scene, targets[:1])))
-    write_video(path, comparison_frames(np.concatenate(truth, 1), np.concatenate(predicted, 1)), scenes[0].fps)
+    rows = {"truth": np.concatenate(truth, 1), "predicted": np.concatenate(predicted, 1)}
+    write_video(path, film_frames(rows, scenes[0].fps, restored.data.history), scenes[0].fps)
