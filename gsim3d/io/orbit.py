@@ -15,6 +15,7 @@ from gsim3d.state import Gaussians
 ELEVATION, FIELD_OF_VIEW = 25.0, 42.0  # degrees
 MARGIN = 1.15  # of the distance at which all is in view
 QUANTILE = 0.98  # of the distances from the middle, that is in view
+NEAR = 0.01  # metres, of large scenes
 FAINT = 0.1  # opacity below which a Gaussian does not count for the view
 
 
@@ -28,26 +29,42 @@ def orbit_frames(frames: Iterable[Gaussians], count: int, size: int, turns: floa
         size: width and height of the images, pixels.
         turns: of the camera, over all frames.
     """
-    centre = distance = None
+    reach = None
     for index, gaussians in enumerate(frames):
-        if centre is None:
-            shown = gaussians.means[gaussians.opacities > FAINT]
-            shown = shown if len(shown) else gaussians.means
-            centre = shown.median(0).values if len(shown) else torch.zeros(3)
-            reach = torch.quantile((shown - centre).norm(dim=1)[:1_000_000], QUANTILE) if len(shown) else 1.0
-            distance = MARGIN * max(float(reach), 1e-3) / math.sin(math.radians(FIELD_OF_VIEW / 2))
-        camera = _camera(centre, distance, 2 * math.pi * turns * index / count, size)
-        image = rasterize_gaussians(
-            gaussians.means,
-            gaussians.quats,
-            gaussians.scales,
-            gaussians.opacities,
-            camera,
-            sh=gaussians.sh,
-            near_plane=1e-3 * distance,
-            on_invalid="drop",
-        ).color[0]
-        yield (image.clamp(0, 1) * 255).round().byte().numpy()
+        reach = reach or _reach(gaussians)
+        yield picture(gaussians, _camera(*reach, 2 * math.pi * turns * index / count, size))
+
+
+def camera_around(gaussians: Gaussians, azimuth: float, size: int) -> Cameras:
+    """A camera of ``size`` by ``size`` pixels that sees ``gaussians`` from ``azimuth`` (radians) and a little above."""
+    return _camera(*_reach(gaussians), azimuth, size)
+
+
+def picture(gaussians: Gaussians, camera: Cameras, background: torch.Tensor | None = None) -> np.ndarray:
+    """One image uint8 [H, W, 3]."""
+    image = rasterize_gaussians(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales,
+        gaussians.opacities,
+        camera,
+        sh=gaussians.sh,
+        background=background,
+        near_plane=min(NEAR, 0.1 * float(camera.near[0])),
+        on_invalid="drop",
+    ).color[0]
+    return (image.clamp(0, 1) * 255).round().byte().numpy()
+
+
+def _reach(gaussians: Gaussians) -> tuple[torch.Tensor, float]:
+    """The middle of what is seen, and the distance from it at which all is in view."""
+    shown = gaussians.means[gaussians.opacities > FAINT]
+    shown = shown if len(shown) else gaussians.means
+    if not len(shown):
+        return torch.zeros(3), MARGIN
+    centre = shown.median(0).values
+    radius = float(torch.quantile((shown - centre).norm(dim=1)[:1_000_000], QUANTILE))
+    return centre, MARGIN * max(radius, 1e-3) / math.sin(math.radians(FIELD_OF_VIEW / 2))
 
 
 def _camera(centre: torch.Tensor, distance: float, azimuth: float, size: int) -> Cameras:

@@ -10,7 +10,7 @@ import numpy as np
 PANEL = 512  # pixels, least height of a panel
 WIDEST = 3840  # pixels of a film, where its images are not wider themselves
 GAP = 4  # pixels of white between panels
-FONT, TEXT, SHADE = cv2.FONT_HERSHEY_SIMPLEX, 1 / 800, 0.4  # scale per pixel of a panel; brightness behind a text
+FONT, TEXT, SHADE = cv2.FONT_HERSHEY_SIMPLEX, 1 / 600, 0.4  # scale per pixel of a panel; brightness behind a text
 WHITE, ACCENT = (255, 255, 255), (255, 157, 77)
 
 

@@ -195,26 +195,16 @@ async function main() {
   const sorter = new Worker(URL.createObjectURL(new Blob([SORTER], { type: "text/javascript" })));
   let ticket = 0, sorting = false, sortedFor = "", inSorter = -1;
 
-  // ---- camera: looks from `eye` at `target`; the first look may be a given camera with its own lens ----
+  // ---- camera: looks from `eye` at `target`; the first look is a given camera with its own lens ----
   const first = header.view, camera = {};
   function reset() {
-    if (first) {
-      const m = first.viewmat, rotation = m.slice(0, 3).map((row) => row.slice(0, 3)), t = m.slice(0, 3).map((row) => row[3]);
-      const eye = [0, 1, 2].map((c) => -(rotation[0][c] * t[0] + rotation[1][c] * t[1] + rotation[2][c] * t[2]) - middle[c]);
-      const reach = Math.max(0.1, -dot(eye, rotation[2]));
-      Object.assign(camera, { target: eye.map((v, c) => v + reach * rotation[2][c]), distance: reach, given: true });
-      const back = rotation[2].map((v) => -v);
-      camera.azimuth = Math.atan2(back[1], back[0]);
-      camera.elevation = Math.asin(Math.max(-1, Math.min(1, back[2])));
-    } else {
-      const at = part(means, 0), seen = part(opacities, 0);
-      let reach = 1e-3;
-      const distances = [];
-      for (let i = 0; i < count; i++) if (seen[i] > 0.1) distances.push(Math.hypot(at[i], at[count + i], at[2 * count + i]));
-      distances.sort((a, b) => a - b);
-      if (distances.length) reach = distances[Math.floor(0.98 * (distances.length - 1))] || reach;
-      Object.assign(camera, { target: [0, 0, 0], distance: 3.2 * reach, azimuth: 0.6, elevation: 0.45, given: false });
-    }
+    const m = first.viewmat, rotation = m.slice(0, 3).map((row) => row.slice(0, 3)), t = m.slice(0, 3).map((row) => row[3]);
+    const eye = [0, 1, 2].map((c) => -(rotation[0][c] * t[0] + rotation[1][c] * t[1] + rotation[2][c] * t[2]) - middle[c]);
+    const reach = Math.max(1e-3, -dot(eye, rotation[2])), back = rotation[2].map((v) => -v);
+    Object.assign(camera, {
+      target: eye.map((v, c) => v + reach * rotation[2][c]), distance: reach, given: true,
+      azimuth: Math.atan2(back[1], back[0]), elevation: Math.asin(Math.max(-1, Math.min(1, back[2]))),
+    });
     changed = true;
   }
   function pose(width, height) {
@@ -229,8 +219,7 @@ async function main() {
     const back = [Math.cos(e) * Math.cos(a), Math.cos(e) * Math.sin(a), Math.sin(e)];
     const forward = back.map((v) => -v), right = unit(cross(forward, [0, 0, 1])), down = cross(forward, right);
     const eye = camera.target.map((v, c) => v + camera.distance * back[c]), rotation = [right, down, forward];
-    const side = Math.min(width, height);
-    const focal = first ? Math.min(width / first.width, height / first.height) * first.K[0][0] : 1.3 * side;
+    const focal = Math.min(width / first.width, height / first.height) * first.K[0][0];
     return { rotation, shift: rotation.map((row) => -dot(row, eye)), lens: [focal, focal, width / 2, height / 2] };
   }
 
@@ -244,6 +233,7 @@ async function main() {
   };
   let wanted = null;
   function paint() {
+    $("poster").hidden = true;
     const { rotation: r, shift: t, lens } = wanted, [width, height] = [canvas.width, canvas.height];
     gl.viewport(0, 0, width, height);
     const [red, green, blue] = header.background;
@@ -266,7 +256,7 @@ async function main() {
     gl.uniformMatrix4fv(uniform("viewmat"), false, [r[0][0], r[1][0], r[2][0], 0, r[0][1], r[1][1], r[2][1], 0, r[0][2], r[1][2], r[2][2], 0, t[0], t[1], t[2], 1]);
     gl.uniform4fv(uniform("lens"), lens);
     gl.uniform2f(uniform("canvas"), width, height);
-    gl.uniform1f(uniform("nearPlane"), 0.01);
+    gl.uniform1f(uniform("nearPlane"), Math.min(0.01, 0.01 * camera.distance));
     gl.uniform1i(uniform("nHarmonics"), nHarmonics);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
     player.painted = [frame, ticket];
@@ -375,7 +365,8 @@ async function main() {
 
 main().catch((error) => {
   $("state").textContent = "";
-  $("problem").style.display = "grid";
+  $("problem").hidden = false;
+  $("poster").hidden = false;
   $("problem").textContent = `This scene cannot be shown: ${error.message}`;
   console.error(error);
 });

@@ -16,10 +16,13 @@ from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
+import torch
 
+from gsim3d.cameras import Cameras
 from gsim3d.errors import InputError
-from gsim3d.io.arrays import Splats, colors_of, splats_of
+from gsim3d.io.arrays import Splats, colors_of, gaussians_of, splats_of
 from gsim3d.io.files import write_whole
+from gsim3d.io.orbit import camera_around, picture
 from gsim3d.math.spherical_harmonics import SH_0
 from gsim3d.state import Gaussians
 
@@ -27,6 +30,7 @@ POSITION_STEP = 1e-3  # metres between grid points: positions are right to half 
 LARGEST_POSITION = 1e6  # metres from the middle of the first frame
 LOG_SCALE_STEP, QUAT_STEP, UNIT_STEP, SH_STEP = 1 / 32, 1 / 2047, 1 / 255, 1 / 128
 LARGEST_COLOR, LARGEST_SH = 4.0, 15.0
+POSTER, AZIMUTH = 512, 0.6  # pixels; radians, of the first look where none is given
 MOST_IMAGES = 2**27  # bytes of encoded images
 
 
@@ -65,7 +69,7 @@ def write_player(
             the next; where frames have fewer Gaussians than others, the rest is invisible.
         fps: frames a second.
         title: shown above the scene.
-        view: the camera of the first look (default: one that sees all).
+        view: the camera of the first look, and of the poster (default: one that sees all).
         truth: uint8 [H, W, 3] images, one a frame, shown beside the scene; seen by ``view``.
         background: colour behind the scene, in [0, 1].
         start: number of the first predicted frame; earlier ones are labelled as given.
@@ -85,7 +89,9 @@ def write_player(
         raise InputError(f"{path}: {len(truth)} true images for {len(splats)} frames")
     header, blobs = _packed(path, splats)
     header |= {"fps": fps, "title": title, "background": list(background), "start": start}
-    header["view"] = None if view is None else _view(view)
+    first = gaussians_of(splats[0], path)
+    view = _around(first) if view is None else view
+    header["view"] = _view(view)
     header["truth"] = _encoded(path, truth) if truth is not None else []
     scripts = "".join(
         f'<script type="text/plain" id="blob{index}">{base64.b64encode(blob).decode()}</script>\n'
@@ -94,6 +100,7 @@ def write_player(
     page = files("gsim3d.viewer").joinpath("player.html").read_text()
     script = files("gsim3d.viewer").joinpath("player.js").read_text()
     filled = page.replace("{{title}}", _escaped(title)).replace("{{script}}", script).replace("{{blobs}}", scripts)
+    filled = filled.replace("{{poster}}", _jpeg(_poster(first, view, background)))
     content = filled.replace("{{header}}", json.dumps(header).replace("<", "\\u003c"))
     write_whole(path, content)
 
@@ -179,16 +186,38 @@ def _view(view: View) -> dict:
     return {"viewmat": viewmat.tolist(), "K": K.tolist(), "width": int(view.width), "height": int(view.height)}
 
 
-def _encoded(path: Path, images: Sequence[np.ndarray]) -> list[str]:
-    """Images as base64 of JPEG."""
+def _around(gaussians: Gaussians) -> View:
+    camera = camera_around(gaussians, AZIMUTH, POSTER)
+    return View(camera.viewmats[0].numpy(), camera.Ks[0].numpy(), POSTER, POSTER)
+
+
+@torch.no_grad()
+def _poster(gaussians: Gaussians, view: View, background: tuple[float, float, float]) -> np.ndarray:
+    """Image uint8 [H, W, 3] of the first look, its longer side of POSTER pixels."""
+    zoom = POSTER / max(view.width, view.height)
+    width, height = (max(1, round(zoom * side)) for side in (view.width, view.height))
+    K = torch.tensor(np.asarray(view.K, np.float64) * [[zoom], [zoom], [1]])[None].float()
+    one = torch.ones(1)
+    viewmat = torch.tensor(np.asarray(view.viewmat, np.float64))[None].float()
+    camera = Cameras(viewmat, K, 0.1 * one, 1e6 * one, torch.tensor([0]), width, height)
+    return picture(gaussians, camera, torch.tensor(background))
+
+
+def _jpeg(image: np.ndarray) -> str:
+    """Base64 of an image as JPEG."""
     import cv2
 
+    content = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])[1]
+    return base64.b64encode(content.tobytes()).decode()
+
+
+def _encoded(path: Path, images: Sequence[np.ndarray]) -> list[str]:
+    """Images as base64 of JPEG."""
     out = []
     for index, image in enumerate(images):
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
             raise InputError(f"{path}: true images must be uint8 [H, W, 3]; image {index} is not")
-        _, content = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
-        out.append(base64.b64encode(content.tobytes()).decode())
+        out.append(_jpeg(image))
     if sum(map(len, out)) > MOST_IMAGES:
         raise InputError(f"{path}: its true images take over {MOST_IMAGES >> 20} MiB; give smaller ones")
     return out

@@ -98,6 +98,12 @@ class Browser:
             event = {"type": kind, "x": x, "y": y, "button": "left", "buttons": 1, "clickCount": 1}
             self._call("Input.dispatchMouseEvent", event)
 
+    def touch(self, *moves: list[tuple[int, int]]) -> None:
+        """Fingers that come down at the first places, move to the next ones, and are lifted."""
+        for kind, places in (("touchStart", moves[0]), *(("touchMove", move) for move in moves[1:]), ("touchEnd", [])):
+            points = [{"x": x, "y": y, "id": finger} for finger, (x, y) in enumerate(places)]
+            self._call("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
     def screenshot(self) -> bytes:
         """PNG."""
         return base64.b64decode(self._call("Page.captureScreenshot", {"format": "png"})["data"])

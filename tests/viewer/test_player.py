@@ -5,6 +5,7 @@ import dataclasses
 import json
 import re
 import zlib
+from importlib.resources import files
 
 import cv2
 import numpy as np
@@ -14,10 +15,11 @@ import torch
 from gsim3d.cameras import Cameras
 from gsim3d.errors import InputError
 from gsim3d.evaluate.metrics import psnr
+from gsim3d.math.spherical_harmonics import SH_0
 from gsim3d.ops import rasterize_gaussians
 from gsim3d.state import Gaussians
 from gsim3d.viewer import write_player
-from gsim3d.viewer.player import POSITION_STEP, View
+from gsim3d.viewer.player import POSITION_STEP, POSTER, View
 from tests.viewer.browser import Browser, chromium
 
 browsing = pytest.mark.skipif(chromium() is None, reason="no Chromium is installed")
@@ -67,14 +69,15 @@ def view():
     return View(viewmat.numpy(), K, SIZE, SIZE)
 
 
-def rendered(gaussians, seen):
+def rendered(gaussians, seen, background=0.0):
     one = torch.ones(1)
     camera = Cameras(
         torch.from_numpy(seen.viewmat)[None].float(), torch.from_numpy(seen.K)[None].float(), one * 0.1, one * 20,
         torch.tensor([0]), seen.width, seen.height,
     )  # fmt: skip
     fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
-    return rasterize_gaussians(*fields, camera, sh=gaussians.sh).color[0].clamp(0, 1)
+    background = torch.full((3,), background)
+    return rasterize_gaussians(*fields, camera, sh=gaussians.sh, background=background).color[0].clamp(0, 1)
 
 
 def unpacked(page):
@@ -112,6 +115,21 @@ def test_player_quantisation_is_within_bounds(tmp_path):
         assert np.abs(channels["colors"][step] - colors).max() <= 0.5 / 255 + 1e-6
         rest = channels["sh"][step].reshape(frame.sh.shape[0], -1, 3)
         assert np.abs(rest - frame.sh[:, 1:].numpy()).max() <= 0.5 / 128 + 1e-6
+
+
+def test_player_poster_is_the_first_look(tmp_path):
+    seen, frames = view(), moving(2)
+    write_player(tmp_path / "a.html", frames, fps=FPS, view=seen, background=(0.2, 0.2, 0.2))
+    content = re.search(r'id="poster".*?base64,([^"]+)', (tmp_path / "a.html").read_text())[1]
+    image = cv2.imdecode(np.frombuffer(base64.b64decode(content), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    K = seen.K * np.array([[POSTER / SIZE], [POSTER / SIZE], [1]])
+    expected = rendered(frames[0], dataclasses.replace(seen, K=K, width=POSTER, height=POSTER), 0.2)
+    assert float(psnr(torch.from_numpy(image.copy())[None].float() / 255, expected[None])) > 30
+
+
+def test_player_is_small():
+    sizes = [files("gsim3d.viewer").joinpath(name).stat().st_size for name in ("player.html", "player.js")]
+    assert sum(sizes) <= 60_000
 
 
 def test_player_frames_of_different_counts(tmp_path):
@@ -157,7 +175,7 @@ def test_write_player_refuses_unusable_input(given, says, tmp_path):
 
 @browsing
 def test_player_in_browser_equals_rasterizer(tmp_path):
-    frames, seen = moving(10), view()
+    frames, seen = moving(10, degree=3), view()
     truth = [(rendered(frame, seen) * 255).byte().numpy() for frame in frames]
     write_player(tmp_path / "a.html", frames, fps=FPS, view=seen, truth=truth, start=3, title="Falling")
     url = (tmp_path / "a.html").as_uri()
@@ -171,6 +189,10 @@ def test_player_in_browser_equals_rasterizer(tmp_path):
             browser.press(key)
             assert browser.value("player.frame") == frame
         assert browser.value("document.getElementById('label').textContent") == "predicted"
+        browser.value("scrub.value = 4, scrub.dispatchEvent(new Event('input'))")
+        assert browser.value("player.frame") == 4 and browser.value("document.getElementById('time').textContent") == (
+            "0.33 s / 0.75 s"
+        )
         for frame in (0, 6):
             browser.value(f"player.show({frame})")
             browser.wait(f"player.idle && player.painted[0] === {frame}")
@@ -192,12 +214,56 @@ def test_player_in_browser_equals_rasterizer(tmp_path):
 
 
 @browsing
-def test_player_respects_reduced_motion(tmp_path):
-    write_player(tmp_path / "a.html", moving(3), fps=FPS)
-    with Browser(300, 300, "--force-prefers-reduced-motion") as browser:
+def test_player_with_reduced_motion_loops_and_is_touched(tmp_path):
+    """A red Gaussian before a large green one, seen where the camera projects them."""
+    seen = view()
+    red, green = ((torch.tensor(c) - 0.5) / SH_0 for c in ((0.9, 0.1, 0.1), (0.1, 0.7, 0.2)))
+    toward = -torch.from_numpy(seen.viewmat[2, :3]).float()
+    pair = dataclasses.replace(
+        make(2, 0),
+        means=torch.stack([torch.tensor([0.0, 0, 0.5]) + 0.5 * toward, torch.tensor([0.0, 0, 0.5])]),
+        scales=torch.tensor([[0.06] * 3, [0.25] * 3]),
+        opacities=torch.tensor([0.99, 0.99]),
+        sh=torch.stack([red, green])[:, None],
+    )
+    write_player(tmp_path / "a.html", [pair] * 3, fps=FPS, view=seen)
+    with Browser(SIZE, SIZE, "--force-prefers-reduced-motion") as browser:
         browser.open((tmp_path / "a.html").as_uri())
         browser.wait("globalThis.player && player.painted !== null")
-        assert not browser.value("player.playing") and browser.value("player.frame") == 0 and not browser.complaints
+        assert not browser.value("player.playing") and browser.value("player.frame") == 0
+        image = canvas_of(browser).astype(int)
+        side, (y, x) = min(image.shape[:2]), (length // 2 for length in image.shape[:2])
+        assert np.abs(image[y, x] - 255 * np.array([0.9, 0.1, 0.1])).max() < 8
+        beside = image[y, x + side // 20]
+        assert beside[1] > 120 and beside[0] < 80
+        browser.press("l")  # no loop
+        browser.press(" ")
+        browser.wait("!player.playing && player.frame === 2")
+        browser.press("l")
+        browser.press(" ")
+        browser.wait("player.playing && player.frame === 1")
+        browser.press(" ")
+        browser.press("Home")
+        browser.wait("player.idle")
+        near = (canvas_of(browser).max(2) > 60).sum()
+        browser.touch([(140, 200), (220, 200)], [(130, 200), (230, 200)], [(80, 200), (280, 200)])
+        browser.wait("player.idle")
+        assert (canvas_of(browser).max(2) > 60).sum() > 1.5 * near
+        before = canvas_of(browser).astype(int)
+        browser.touch([(180, 200)], [(200, 180)], [(240, 180)])
+        browser.wait("player.idle")
+        assert np.abs(canvas_of(browser) - before).max() > 60 and not browser.complaints
+
+
+@browsing
+def test_player_without_webgl_shows_its_poster(tmp_path):
+    frames = moving(2)
+    write_player(tmp_path / "a.html", frames, fps=FPS, view=view())
+    with Browser(SIZE, SIZE, "--disable-3d-apis") as browser:
+        browser.open((tmp_path / "a.html").as_uri())
+        browser.wait("document.getElementById('problem') && !document.getElementById('problem').hidden")
+        assert "WebGL 2" in browser.value("document.getElementById('problem').textContent")
+        assert browser.value("!poster.hidden && poster.naturalWidth") == POSTER
 
 
 def canvas_of(browser) -> np.ndarray:
