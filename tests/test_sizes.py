@@ -13,7 +13,7 @@ SPEC.loader.exec_module(sizes)
 TODAY = {
     "lines of the package": 36_100,
     "lines of the library without io": 13_400,
-    "lines of readers, writers and the viewer": 3_720,
+    "lines of readers, writers and the viewer": 3_890,
 }
 
 
