@@ -40,7 +40,8 @@ def run(args: argparse.Namespace) -> int:
     from gsim3d.errors import InputError
     from gsim3d.train.restore import restore
     from gsim3d.viewer.server import LOCAL, PUBLIC, Viewer, load_viser
-    from gsim3d.viewer.targets import Simulation, open_target
+    from gsim3d.viewer.simulation import Simulation
+    from gsim3d.viewer.targets import open_target
 
     load_viser()
     simulation = None

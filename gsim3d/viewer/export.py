@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -46,14 +46,29 @@ def export(
     Raises:
         InputError: ``target`` cannot be read, or ``to`` cannot hold it.
     """
-    out, sequence = new_output_path(to, "file"), open_sequence(target, up)
-    fps, suffix = fps or sequence.fps or FPS, out.suffix.lower()
+    sequence = open_sequence(target, up)
     chosen = range(len(sequence))
     if frame is not None:
         if not -len(sequence) <= frame < len(sequence):
             raise InputError(f"--frame {frame}: {target} has {len(sequence)} frames, from 0")
         chosen = [frame % len(sequence)]
     frames = (sequence[index] for index in progress(chosen, unit="frame"))
+    return write_frames(to, frames, len(chosen), fps=fps or sequence.fps or FPS, up=up_to, size=size, turns=turns)
+
+
+def write_frames(
+    to: str | Path,
+    frames: Iterable[Gaussians],
+    count: int,
+    *,
+    fps: float = FPS,
+    up: str | None = None,
+    size: int = 512,
+    turns: float | None = None,
+) -> str:
+    """Writes ``count`` frames as the file ``to``, as :func:`export` does, with its arguments and errors."""
+    out = new_output_path(to, "file")
+    suffix = out.suffix.lower()
     if suffix == ".mp4":
         if size % 2:
             raise InputError(f"--size must be even for a video; got {size}")
@@ -65,17 +80,17 @@ def export(
         what = f"{max(one.means.shape[0] for one in gaussians):,} Gaussians for any browser"
     else:
         suffix, kind = format_of(out)
-        if len(chosen) > 1 and not kind.has_time:
+        if count > 1 and not kind.has_time:
             raise InputError(
-                f"--to {to}: {suffix} holds one frame, and {target} has {len(sequence)}: choose one with --frame, or "
-                "write .html, .usdc or .mp4"
+                f"{to}: {suffix} holds one frame, and there are {count}: choose one (--frame), or write .html, .usdc "
+                "or .mp4"
             )
         gaussians = list(frames)
-        write_splats(out, gaussians if kind.has_time else gaussians[0], fps=fps, up=up_to)
+        write_splats(out, gaussians if kind.has_time else gaussians[0], fps=fps, up=up)
         what = f"{gaussians[0].means.shape[0]:,} Gaussians, {kind.about}"
         if max(one.sh.shape[1] for one in gaussians) > (kind.most_degree + 1) ** 2:
             what += f"; colours that depend on the view are not kept by {suffix}"
-    rate = f"{len(chosen)} frames, {fps:g} a second, " if len(chosen) > 1 else ""
+    rate = f"{count} frames, {fps:g} a second, " if count > 1 else ""
     return f"{out}: {rate}{what}; {out.stat().st_size / 1e6:.2f} MB"
 
 

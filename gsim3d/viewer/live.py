@@ -15,12 +15,11 @@ from torch import Tensor
 
 from gsim3d.data import Scene
 from gsim3d.errors import InputError, did_you_mean
-from gsim3d.io import write_splats
 from gsim3d.io.arrays import colors_of, dc_of, splats_of
-from gsim3d.io.files import new_output_path
 from gsim3d.math.rotations import rotation_matrices, rotation_to_quat
 from gsim3d.ops import rasterize_gaussians
-from gsim3d.state import ASLEEP, DYNAMIC, Gaussians, Particles
+from gsim3d.state import ASLEEP, DYNAMIC, FROZEN, Gaussians, Particles
+from gsim3d.viewer.export import write_frames
 
 COLORINGS = ("appearance", "velocity", "activity", "latents")
 AWAKE_COLOR, FROZEN_COLOR, ASLEEP_COLOR = (0.95, 0.5, 0.1), (0.55, 0.55, 0.55), (0.2, 0.45, 0.95)
@@ -273,25 +272,28 @@ class Target:
         if layers.coloring != "appearance":
             changes["sh"] = torch.from_numpy(dc_of(self.colors(frame, layers.coloring).numpy()))[:, None]
         gaussians = dataclasses.replace(gaussians, **changes)
-        if not self.particles or layers.moving and layers.frozen:
+        rows = self.rows(frame, layers)
+        if bool(rows.all()):
             return gaussians
-        moves = self.particles[frame].activity.cpu() != 1
-        chosen = moves if layers.moving else ~moves if layers.frozen else torch.zeros_like(moves)
-        fields = {name: getattr(gaussians, name)[chosen] for name in ("means", "quats", "scales", "opacities", "sh")}
-        return dataclasses.replace(gaussians, **fields, cu_rows=torch.tensor([0, int(chosen.sum())]))
+        fields = {name: getattr(gaussians, name)[rows] for name in ("means", "quats", "scales", "opacities", "sh")}
+        return dataclasses.replace(gaussians, **fields, cu_rows=torch.tensor([0, int(rows.sum())]))
 
-    def export(self, path: str | Path, frame: int, layers: Layers) -> Path:
-        """Writes what is seen of a frame in the format of the suffix of ``path``.
+    def rows(self, frame: int, layers: Layers) -> Tensor:
+        """bool [N], the Gaussians of a frame that ``layers`` show."""
+        if not self.particles:
+            return torch.ones(len(self.gaussians(frame).means), dtype=torch.bool)
+        is_frozen = self.particles[frame].activity.cpu() == FROZEN
+        return torch.where(is_frozen, torch.tensor(layers.frozen), torch.tensor(layers.moving))
+
+    def export(self, path: str | Path, frames: Sequence[int], layers: Layers) -> str:
+        """Writes what is seen of ``frames`` as ``gsim3d export`` does; returns one line about what was written.
 
         Raises:
-            InputError: there are no Gaussians, ``path`` exists, or its suffix is that of no format.
+            InputError: there are no Gaussians, ``path`` exists, or its format cannot hold them.
         """
-        gaussians = self.seen(frame, layers)
-        if gaussians is None:
+        if self.gaussians(0) is None:
             raise InputError(f"{self.name} holds no Gaussians that could be written to {path}")
-        out = new_output_path(path, "file")
-        write_splats(out, gaussians, fps=self.fps)
-        return out
+        return write_frames(path, (self.seen(frame, layers) for frame in frames), len(frames), fps=self.fps)
 
     def views(self, frame: int, cams: Sequence[int]) -> list[View]:
         """Cameras ``cams`` of the scene at a frame."""

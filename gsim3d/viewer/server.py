@@ -14,13 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, NumericalError
 from gsim3d.viewer.live import SIZES, SPEEDS, Layers, Target, Timeline, splatting_of, unit_of
-from gsim3d.viewer.targets import OPERATIONS, Simulation
+from gsim3d.viewer.panel import SimulationPanel
+from gsim3d.viewer.simulation import Simulation
 
 LOCAL, PUBLIC = "127.0.0.1", "0.0.0.0"
 MOST_CAMERAS = 16  # of a scene that are drawn, spread evenly
 TICK = 1 / 60  # seconds between looks at the clock
+EXPORT = "on the machine of the server; must not exist yet. .ply, .splat, .spz, .glb, .usdc, .html, .mp4, ..."
 
 
 def load_viser() -> Any:
@@ -50,6 +52,7 @@ class Viewer:
         timeline: which frame is shown.
         layers: what of it is drawn.
         address: for a browser.
+        server: of viser.
     """
 
     def __init__(
@@ -74,11 +77,11 @@ class Viewer:
         self._unit = 1.0 if first is None else unit_of(first)
         self._splats, self._frusta, self._closed = None, {}, threading.Event()
         with contextlib.redirect_stdout(io.StringIO()):  # its banner
-            self._server = viser.ViserServer(host, free_port(host, port), label=f"gsim3d: {target.name}", verbose=False)
-        self.address = f"http://{LOCAL if host == PUBLIC else host}:{self._server.get_port()}"
+            self.server = viser.ViserServer(host, free_port(host, port), label=f"gsim3d: {target.name}", verbose=False)
+        self.address = f"http://{LOCAL if host == PUBLIC else host}:{self.server.get_port()}"
         self._look_at_target()
         self._add_controls()
-        self._draw()
+        self.draw()
         self._clock = threading.Thread(target=self._run, daemon=True)
         self._clock.start()
 
@@ -93,7 +96,7 @@ class Viewer:
         self._closed.set()
         self._clock.join()
         with self._lock, contextlib.redirect_stdout(io.StringIO()):
-            self._server.stop()
+            self.server.stop()
 
     def wait(self) -> None:
         """Returns when the viewer is closed, for example by another thread."""
@@ -106,13 +109,13 @@ class Viewer:
             with self._lock:
                 now = time.monotonic()
                 if self.timeline.advance(now - before):
-                    self._draw()
+                    self.draw()
                     now = time.monotonic() if not self.timeline.playing else now
                 before = now
 
     def _look_at_target(self) -> None:
         """Where a browser begins: above and behind the first camera, or all Gaussians from the side."""
-        camera, scene = self._server.initial_camera, self._server.scene
+        camera, scene = self.server.initial_camera, self.server.scene
         scene.set_up_direction("+z")
         gaussians = self._target.gaussians(0)
         if self._cams:
@@ -131,83 +134,59 @@ class Viewer:
     # Controls. A callback runs in a thread of viser's; the lock lets one of them at a time change what is drawn.
 
     def _add_controls(self) -> None:
-        gui, target, n = self._server.gui, self._target, self.timeline.n_frames
+        gui, target, n = self.server.gui, self._target, self.timeline.n_frames
         with gui.add_folder("Time"):
             self._play = gui.add_button("Play", disabled=n < 2)
             self._frame = gui.add_slider("Frame", 0, max(n - 1, 1), 1, 0, disabled=n < 2)
             speed = gui.add_slider("Speed", *SPEEDS, 0.1, 1.0)
             loop = gui.add_checkbox("Loop", True)
             self._status = gui.add_markdown("")
-        self._on(self._play, self._toggle, "on_click")
-        self._on(self._frame, lambda: self._seek(int(self._frame.value)))
-        self._on(speed, lambda: self.timeline.set_speed(speed.value))
-        self._on(loop, lambda: setattr(self.timeline, "loop", loop.value))
+        self.on(self._play, self._toggle, "on_click")
+        self.on(self._frame, lambda: self._seek(int(self._frame.value)))
+        self.on(speed, lambda: self.timeline.set_speed(speed.value))
+        self.on(loop, lambda: setattr(self.timeline, "loop", loop.value))
         with gui.add_folder("Layers"):
             shown = ["moving", "frozen"] if target.particles else []
             for name in shown + (["cameras", "truth"] if self._cams else []):
                 box = gui.add_checkbox(name, True)
-                self._on(box, partial(self._change_layer, name, box))
+                self.on(box, partial(self._change_layer, name, box))
             if target.gaussians(0) is not None:
                 coloring = gui.add_dropdown("Colours", target.colorings)
                 size = gui.add_slider("Size", *SIZES, 0.05, 1.0, hint="of the drawn Gaussians")
-                self._on(coloring, partial(self._change_layer, "coloring", coloring))
-                self._on(size, partial(self._change_layer, "size", size))
+                self.on(coloring, partial(self._change_layer, "coloring", coloring))
+                self.on(size, partial(self._change_layer, "size", size))
         self._beside = self._camera = None
         if self._cams:
             names = [f"{cam}: {target.scene.camera_names[cam]}" for cam in range(target.scene.n_cams)]
             with gui.add_folder("Truth | prediction" if target.gaussians(0) is not None else "Recorded"):
                 self._camera = gui.add_dropdown("Camera", names)
                 self._beside = gui.add_image(np.zeros((16, 16, 3), np.uint8), format="png")
-            self._on(self._camera, self._draw)
+            self.on(self._camera, self.draw)
         if target.gaussians(0) is not None:
             with gui.add_folder("Export", expand_by_default=False):
-                path = gui.add_text("File", "seen.ply", hint="on the machine of the server; must not exist yet")
+                path = gui.add_text("File", "seen.ply", hint=EXPORT)
+                what = gui.add_dropdown("Frames", ("the shown one", "all"), disabled=n < 2)
                 write = gui.add_button("Write what is seen")
-            self._on(write, lambda: self._export(path.value), "on_click")
+            self.on(write, lambda: self._export(path.value, what.value == "all"), "on_click")
         if self._simulation is not None:
-            self._add_edits()
-
-    def _add_edits(self) -> None:
-        gui, means = self._server.gui, self._target.gaussians(0).means
-        middle = tuple(float(x) for x in means.median(0).values)
-        with gui.add_folder("Simulate on"):
-            chosen = gui.add_dropdown("Edit", ("none", *OPERATIONS))
-            which = gui.add_dropdown("Particles", ("moving", "frozen", "all"))
-            inside = gui.add_checkbox("Inside of the box", False)
-            centre, size = gui.add_vector3("Middle", middle, step=0.01), gui.add_vector3("Sides", (0.5,) * 3, step=0.01)
-            vector = gui.add_vector3("Vector", (0.0, 0.0, 0.1), step=0.01, hint="metres, metres a step, or a colour")
-            n_steps = gui.add_number("Steps", 12, min=1, max=1000, step=1)
-            button = gui.add_button("Simulate on from this frame")
-        box = self._server.scene.add_box("/box", (255, 160, 0), size.value, wireframe=True, visible=False)
-
-        def place() -> None:
-            box.position, box.dimensions, box.visible = centre.value, size.value, inside.value
-
-        def simulate() -> None:
-            corners = None
-            if inside.value:
-                middle, half = np.array(centre.value), np.abs(size.value) / 2
-                corners = middle - half, middle + half
-            made = []
-            if chosen.value != "none":
-                made = [self._simulation.operation(chosen.value, which.value, vector.value, corners)]
-            self.simulate_on(int(n_steps.value), made)
-
-        for handle in (inside, centre, size):
-            self._on(handle, place)
-        self._on(button, simulate, "on_click")
+            self._panel = SimulationPanel(self, self._simulation)
 
     def simulate_on(self, n_steps: int, operations: list) -> None:
         """Predicts the frames after the one that is shown anew, as :meth:`Simulation.simulate_on` does."""
         with self._lock:
             self.timeline.pause()
             self._simulation.simulate_on(self.timeline.frame, n_steps, operations)
-            self.timeline.resize(self._target.n_frames)
-            self._frame.max = self.timeline.n_frames - 1
-            self._draw()
+            self._panel.forget()
+            self._frames_changed()
 
-    def _on(self, handle: Any, act: Callable[[], Any], event: str = "on_update") -> None:
-        """Calls ``act`` when a user changes ``handle``; an InputError of it is shown in the browser."""
+    def _frames_changed(self) -> None:
+        self.timeline.resize(self._target.n_frames)
+        self._frame.max = max(self.timeline.n_frames - 1, 1)
+        self._frame.disabled = self._play.disabled = self.timeline.n_frames < 2
+        self.draw()
+
+    def on(self, handle: Any, act: Callable[..., Any], event: str = "on_update") -> None:
+        """Calls ``act`` when a user changes ``handle``, or with the click in a scene; its InputError is shown there."""
 
         def call(change: Any) -> None:
             if change.client is None:  # changed by this class
@@ -216,37 +195,38 @@ class Viewer:
                 if self._closed.is_set():
                     return
                 try:
-                    act()
-                except InputError as error:
+                    act(change) if handle is self.server.scene else act()
+                except (InputError, NumericalError) as error:
                     change.client.add_notification("Not possible", str(error), color="red")
 
-        getattr(handle, event)(call)
+        register = getattr(handle, event)
+        (register() if handle is self.server.scene else register)(call)
 
     def _toggle(self) -> None:
         (self.timeline.pause if self.timeline.playing else self.timeline.play)()
-        self._draw()
+        self.draw()
 
     def _seek(self, frame: int) -> None:
         self.timeline.pause()
         self.timeline.seek(frame)
-        self._draw()
+        self.draw()
 
     def _change_layer(self, name: str, handle: Any) -> None:
         self.layers = dataclasses.replace(self.layers, **{name: handle.value})
-        self._draw()
+        self.draw()
 
-    def _export(self, path: str) -> None:
-        out = self._target.export(path, self.timeline.frame, self.layers)
-        self._status.content = f"Written: `{out}`"
+    def _export(self, path: str, is_whole: bool) -> None:
+        frames = range(self._target.n_frames) if is_whole else [self.timeline.frame]
+        self._status.content = f"Written: {self._target.export(path, frames, self.layers)}"
 
     # Drawing
 
-    def _draw(self) -> None:
+    def draw(self) -> None:
         """Sends the frame that is shown, all of it at one time."""
         with self._lock:
             frame = self.timeline.frame
             seen = self._target.seen(frame, self.layers)
-            with self._server.atomic():
+            with self.server.atomic():
                 if seen is not None:
                     self._draw_splats(*splatting_of(seen, self._unit))
                 self._draw_cameras(frame)
@@ -258,6 +238,8 @@ class Viewer:
                 self._frame.value = frame
                 self._play.label = "Pause" if self.timeline.playing else "Play"
                 self._status.content = self._description(frame, 0 if seen is None else len(seen.means))
+                if self._simulation is not None and not self.timeline.playing:
+                    self._panel.frame_shown(frame)
 
     def _description(self, frame: int, count: int) -> str:
         given = " (input)" if frame < self._target.n_encoded else ""
@@ -269,7 +251,7 @@ class Viewer:
 
     def _draw_splats(self, *arrays: np.ndarray) -> None:
         if self._splats is None:
-            self._splats = self._server.scene.add_gaussian_splats("/gaussians", *arrays, scale=self._unit)
+            self._splats = self.server.scene.add_gaussian_splats("/gaussians", *arrays, scale=self._unit)
         else:
             self._splats.set_gaussians(*arrays)
 
@@ -280,7 +262,7 @@ class Viewer:
             for cam, view in zip(self._cams, self._target.views(frame, self._cams), strict=True):
                 if cam not in self._frusta:
                     size = {"scale": self._frustum_size, "thickness": 0.04 * self._frustum_size}
-                    add = self._server.scene.add_camera_frustum
+                    add = self.server.scene.add_camera_frustum
                     self._frusta[cam] = add(f"/cameras/{cam}", view.fov, view.aspect, **size, format="jpeg")
                 frustum = self._frusta[cam]
                 frustum.wxyz, frustum.position, frustum.image = view.quat, view.position, view.image

@@ -32,7 +32,8 @@ from gsim3d.viewer.live import (
     splatting_of,
     unit_of,
 )
-from gsim3d.viewer.targets import Simulation, open_target
+from gsim3d.viewer.simulation import Simulation
+from gsim3d.viewer.targets import open_target
 from tests.test_simulator import SIZE, make_simulator
 from tests.tiny_scenes import N_CAMS, write_scene
 from tests.viewer.browser import Browser, chromium
@@ -154,14 +155,15 @@ def test_single_frame_has_appearance_alone():
 def test_size_and_coloring_change_what_is_seen_and_exported(tmp_path):
     target = target_of(falling())
     layers = Layers(coloring="velocity", size=0.5)
-    out = target.export(tmp_path / "seen.ply", 2, layers)
+    out = tmp_path / "seen.ply"
+    assert f"{out}: 2 Gaussians" in target.export(out, [2], layers)
     written = read_splats(out)
     torch.testing.assert_close(written.scales, torch.full((2, 3), 0.05))
     torch.testing.assert_close(0.5 + SH_0 * written.sh[:, 0], target.colors(2, "velocity"))
     with pytest.raises(InputError, match="exists already"):
-        target.export(out, 2, layers)
+        target.export(out, [2], layers)
     with pytest.raises(InputError, match="no format"):
-        target.export(tmp_path / "seen.txt", 2, layers)
+        target.export(tmp_path / "seen.txt", [2], layers)
 
 
 @pytest.mark.parametrize("scale", [1e-4, 0.01, 30.0])
@@ -185,7 +187,7 @@ def test_scene_shows_its_cameras_and_images(scene):
     assert views[0].fov == pytest.approx(2 * np.arctan(0.5 / 1.3))
     assert target.beside(0, 0, Layers()).shape == (SIZE, SIZE, 3)
     with pytest.raises(InputError, match="holds no Gaussians"):
-        target.export("a.ply", 0, Layers())
+        target.export("a.ply", [0], Layers())
 
 
 @pytest.fixture
@@ -262,7 +264,7 @@ def test_simulate_on_equals_one_rollout_with_all_edits(simulation, checkpoint, s
     assert torch.equal(target.particles[2].means, first)
     assert (target.particles[3].means - first)[:, 2].mean() > 0.3
     again = simulated(checkpoint, scene, 1)
-    state, plan = again._state, again._simulator.plan(again._spec)
+    state, plan = again._state, again._simulator.plan(again.effects)
     with torch.no_grad():
         steps = again._simulator.rollout(state, 4, plan, edits=simulation.edits)
     assert torch.equal(target.particles[-1].means, steps[-1].means)

@@ -1,0 +1,305 @@
+"""A scene that a simulator predicts while it is looked at: edits, bodies, and effects with their measured costs."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsim3d.data import Scene
+from gsim3d.dynamics import concatenate, last_steps
+from gsim3d.effects.edits import Duplicate, Edit, Move, Operation, Recolor, Remove, Throw, structure_of
+from gsim3d.effects.plan import Plan
+from gsim3d.effects.selection import Selection
+from gsim3d.effects.spec import BACKGROUNDS, CHANGING, POLICIES, EffectsSpec, OutputEffects, Sleep, UnsupportedEffect
+from gsim3d.errors import InputError
+from gsim3d.priors.movable import Movable
+from gsim3d.priors.segmentation import SegmentationConfig, segment_bodies
+from gsim3d.state import FROZEN, Gaussians, Particles
+from gsim3d.train.restore import Restored
+from gsim3d.viewer.live import Target
+
+OPERATIONS = {"move": Move, "throw": Throw, "remove": Remove, "duplicate": Duplicate, "recolor": Recolor}
+VECTORS = {"move": "by", "throw": "velocity", "duplicate": "by", "recolor": "color"}
+TIMED, ROUNDS = 3, 2  # steps that are timed for each setting, and rounds, of which the fastest counts
+MARGIN = 0.03  # of the longest side of a body, around it
+HIT, NEAR = 2.0, 0.01  # a ray hits what is nearer to it than so many standard deviations, or such a share of the depth
+SEEN = 0.2  # least opacity of what a ray hits
+Box = tuple[Sequence[float], Sequence[float]]
+
+
+@dataclass(frozen=True)
+class Part:
+    """Steps that were predicted in one go.
+
+    Attributes:
+        first: of them, counted from the first predicted one of all.
+        edits: made right before it.
+        history: steps before it as the model saw them, after the edits.
+        steps: predicted particles.
+    """
+
+    first: int
+    edits: tuple[Edit, ...]
+    history: Particles
+    steps: list[Particles]
+
+
+@dataclass(frozen=True)
+class Switch:
+    """An effect of the plan.
+
+    Attributes:
+        name: as ``gsim3d plan`` has it.
+        now: the setting that is chosen.
+        settings: setting -> effects with it; one alone where there is no choice.
+        why: why other settings are not possible with this model; empty: all are.
+    """
+
+    name: str
+    now: str
+    settings: dict[str, EffectsSpec]
+    why: str = ""
+
+
+class Simulation:
+    """A scene and the simulator that predicts it, loaded once.
+
+    Attributes:
+        target: what it shows: given frames, then predicted ones.
+        effects: what the next predicted part computes.
+        seconds_a_step: that the last prediction took.
+    """
+
+    def __init__(self, restored: Restored, source: Scene | Particles, n_steps: int | None = None, start: int = 0):
+        """
+        Args:
+            restored: simulator.
+            source: a scene that was opened by ``restored``, or the last steps of one, as particles of this model.
+            n_steps: to predict; None: to the end of the recording, or 12 of particles.
+            start: first input step of a scene.
+        Raises:
+            InputError: the scene has too few steps or cameras.
+        """
+        self._simulator, self._parts, self.seconds_a_step = restored.simulator, [], 0.0
+        spec, plan = restored.plan.spec, restored.plan
+        self.effects = dataclasses.replace(
+            spec,
+            dynamics=dataclasses.replace(spec.dynamics, history=plan.history),
+            appearance=dataclasses.replace(spec.appearance, view_dependent=plan.sh_degree),
+            outputs=OutputEffects(),
+        )
+        about = {"name": "state", "fps": restored.fps or 24.0}
+        if isinstance(source, Scene):
+            inputs = restored.simulator.inputs
+            frames = source.input_frames(inputs, start=start)
+            with torch.no_grad():
+                state = restored.simulator.encode(
+                    frames.subsample(inputs.background_stride, inputs.body_stride).to(restored.device)
+                )
+            about = {"name": source.name, "fps": source.fps, "scene": source, "first": start}
+            n_steps = n_steps or max(1, source.n_steps - start - state.n_clouds)
+        else:
+            state = source.to(restored.device)
+        self._state, self._sh_degree = state, plan.sh_degree
+        offset = state.world_offset
+        self._offset = [0.0, 0.0, 0.0] if offset is None else offset[0].tolist()
+        given = [state.select_clouds([cloud]) for cloud in range(state.n_clouds)]
+        self.target = Target(draw=self._draw, particles=given, n_encoded=len(given), **about)
+        self.simulate_on(len(given) - 1, n_steps or 12)
+
+    @property
+    def edits(self) -> tuple[Edit, ...]:
+        """Changes of the scene up to now, their steps counted from the first predicted one."""
+        return tuple(edit for part in self._parts for edit in part.edits)
+
+    def _draw(self, particles: Particles) -> Gaussians:
+        return self._simulator.renderer(particles, sh_degree=self._sh_degree)
+
+    def _step_after(self, frame: int) -> int:
+        step, n_given = frame + 1 - self.target.n_encoded, self.target.n_encoded
+        if not 0 <= step <= self.target.n_frames - n_given:
+            raise InputError(f"simulate on: frame {frame} must be from {n_given - 1} to {self.target.n_frames - 1}")
+        return step
+
+    def _history(self, step: int) -> Particles:
+        """Steps before ``step``, as the model saw or made them."""
+        part = next((part for part in reversed(self._parts) if part.first < step), None)
+        if part is None:
+            return self._state
+        known = concatenate([part.history, *part.steps[: step - part.first]])
+        return last_steps(known, 2**self._simulator.config.dynamics.history_bits)
+
+    def _timed(self, history: Particles, n_steps: int, plan: Plan) -> tuple[list[Particles], float]:
+        """Predicted steps, and the seconds that one and its Gaussians took."""
+        began = time.perf_counter()
+        steps = self._simulator.rollout(history, n_steps, plan)
+        for particles in steps:
+            drawn = self._simulator.renderer(particles, sh_degree=plan.sh_degree)
+        drawn.means.sum().item()  # waits for the device
+        return steps, (time.perf_counter() - began) / n_steps
+
+    @torch.no_grad()
+    def simulate_on(self, frame: int, n_steps: int, operations: Sequence[Operation] = ()) -> float:
+        """Predicts the frames after ``frame`` anew, with the effects that are on; earlier edits stay, later ones go.
+
+        Args:
+            frame: the last that stays as it is.
+            n_steps: to predict after it.
+            operations: changes of the scene right after ``frame``.
+        Returns:
+            Seconds that a step took.
+        Raises:
+            InputError: an operation cannot be made, and nothing has changed; or ``frame`` is not the last given or a
+                predicted one.
+        """
+        step = self._step_after(frame)
+        if n_steps < 1:
+            raise InputError(f"simulate on: steps must be at least 1; got {n_steps}")
+        edits = tuple(Edit(step, one) for one in operations)
+        plan = self._simulator.plan(dataclasses.replace(self.effects, structure=structure_of(edits)))
+        history = self._simulator._prepare(self._history(step), plan)
+        for edit in edits:
+            history = edit.apply(history, self._simulator._colors)
+        history = self._simulator.dynamics.initialize(history) if edits else history
+        steps, self.seconds_a_step = self._timed(history, n_steps, plan)
+        self._parts = [part for part in self._parts if part.first < step] + [Part(step, edits, history, steps)]
+        self._sh_degree = plan.sh_degree
+        self.target.replace([*self.target.particles[: frame + 1], *steps])
+        return self.seconds_a_step
+
+    def operation(self, name: str, which: str, vector: Sequence[float], box: Box | None = None) -> Operation:
+        """The operation that a user chose.
+
+        Args:
+            name: one of OPERATIONS.
+            which: particles, as of :class:`gsim3d.effects.selection.Selection`.
+            vector: metres of a move or a copy, metres a step of a throw, or a colour.
+            box: lowest and highest corner, in the axes of the viewer; None: everywhere.
+        Raises:
+            InputError: there is no such operation or selection.
+        """
+        if name not in OPERATIONS:
+            raise InputError(f"operation must be one of {', '.join(OPERATIONS)}; got {name!r}")
+        corners = None
+        if box is not None:
+            corners = tuple(tuple(float(x) + o for x, o in zip(corner, self._offset, strict=True)) for corner in box)
+        fields = {VECTORS[name]: tuple(float(x) for x in vector)} if name in VECTORS else {}
+        return OPERATIONS[name](Selection(which, corners), **fields)
+
+    # Bodies
+
+    @torch.no_grad()
+    def bodies(self, frame: int) -> list[Tensor]:
+        """Rows of the particles of each body of a frame, int64, the largest body first."""
+        particles = self.target.particles[frame]
+        rows = (particles.activity != FROZEN).nonzero()[:, 0]
+        if not len(rows):
+            return []
+        body = particles.body  # known where the model segments bodies, along a prediction
+        if body is None:
+            movable = Movable(particles, self._simulator.config.dynamics.grid_size)
+            body = segment_bodies(movable, particles, SegmentationConfig())
+        _, label, count = torch.unique(body[rows], dim=0, return_inverse=True, return_counts=True)
+        return [rows[label == one] for one in count.argsort(descending=True).tolist()]
+
+    def box_of(self, frame: int, rows: Tensor) -> Box:
+        """Lowest and highest corner of a body in the steps that the model sees when it goes on after ``frame``.
+
+        Args:
+            frame: given or predicted.
+            rows: of :meth:`bodies` of this frame.
+        """
+        points = [self.target.particles[frame].means[rows]]
+        for before in range(frame - 1, max(-1, frame - self.effects.dynamics.history), -1):
+            means, middle = self.target.particles[before].means, points[-1].mean(0)
+            found = [means[one] for one in self.bodies(before)]
+            points += [min(found, key=lambda one: float((one.mean(0) - middle).norm()))] if found else []
+        low, high = torch.cat(points).amin(0), torch.cat(points).amax(0)
+        margin = MARGIN * (high - low).max().clamp(min=1e-3)
+        return (low - margin).tolist(), (high + margin).tolist()
+
+    # Effects
+
+    def switches(self) -> list[Switch]:
+        """Every effect of the plan with the settings that this model has; those without a choice say why."""
+        made = [self._switch(name, group, field, values) for name, (group, field, values) in self._choices().items()]
+        kept = {
+            "insert, remove": "on while an edit adds or removes particles",
+            **dict.fromkeys(self._simulator.plan(self.effects).priors, "a prior is a part of the trained weights"),
+        }
+        return made + [Switch(name, "on", {"on": self.effects}, why) for name, why in kept.items()]
+
+    def _choices(self) -> dict[str, tuple[str, str, dict]]:
+        """Effect -> group and field of a spec, and setting -> value."""
+        sleep = self.effects.dynamics.sleep or Sleep()
+        history = [2**bits for bits in range(self._simulator.config.dynamics.history_bits + 1)]
+        sleeps = {policy: dataclasses.replace(sleep, policy=policy) for policy in POLICIES}
+        return {
+            "history": ("dynamics", "history", {f"{n} step{'s' * (n > 1)}": n for n in history}),
+            "background": ("dynamics", "background", {name: name for name in BACKGROUNDS}),
+            "sleep": ("dynamics", "sleep", {"off": None, **sleeps}),
+            "view_dependent": ("appearance", "view_dependent", {f"degree {n}" if n else "off": n for n in range(4)}),
+            "changing": ("appearance", "changing", {name: name for name in CHANGING}),
+            "opacity_changes": ("appearance", "opacity_changes", {"off": False, "on": True}),
+        }
+
+    def _switch(self, name: str, group: str, field: str, values: dict) -> Switch:
+        settings, refused, mine = {}, {}, getattr(self.effects, group)
+        for label, value in values.items():
+            spec = dataclasses.replace(self.effects, **{group: dataclasses.replace(mine, **{field: value})})
+            try:
+                self._simulator.plan(spec)
+            except UnsupportedEffect as error:
+                refused[label] = str(error).partition(": ")[2].partition("; ")[0]
+                continue
+            settings[label] = spec
+        value = getattr(mine, field)
+        now = next((label for label in settings if values[label] == value), next(iter(settings)))
+        return Switch(name, now, settings, "; ".join(f"{label}: {why}" for label, why in refused.items()))
+
+    def choose(self, name: str, setting: str) -> None:
+        """Switches an effect for the next predicted part. Raises InputError where there is no such setting."""
+        known = next((switch.settings for switch in self.switches() if switch.name == name), {})
+        if setting not in known:
+            raise InputError(f"effect {name}: {setting!r} is not possible; it has {', '.join(known) or 'no settings'}")
+        self.effects = known[setting]
+
+    @torch.no_grad()
+    def costs(
+        self, frame: int, progress: Callable[[float], object] = lambda share: None
+    ) -> list[tuple[str, str, float]]:
+        """Effect, setting and milliseconds of a step on this machine, the other effects as they are now.
+
+        Args:
+            frame: whose next steps are timed.
+            progress: called with the share that is done.
+        """
+        history = self._history(self._step_after(max(frame, self.target.n_encoded - 1)))
+        wanted = [
+            (s.name, label, spec) for s in self.switches() if len(s.settings) > 1 for label, spec in s.settings.items()
+        ]
+        found = []
+        for done, (name, label, spec) in enumerate(wanted):
+            progress(done / len(wanted))
+            plan = self._simulator.plan(spec)
+            seconds = min(self._timed(history, TIMED, plan)[1] for _ in range(ROUNDS))
+            found.append((name, label, 1000 * seconds))
+        progress(1.0)
+        return found
+
+
+def hit(gaussians: Gaussians, rows: Tensor, origin: Sequence[float], direction: Sequence[float]) -> int | None:
+    """The row of the nearest of the ``rows`` (bool [N]) that a ray hits; None where it hits nothing."""
+    ray = torch.nn.functional.normalize(gaussians.means.new_tensor(direction), dim=0)
+    offset = gaussians.means - gaussians.means.new_tensor(origin)
+    depth = offset @ ray
+    apart = (offset - depth[:, None] * ray).norm(dim=1)
+    reach = torch.maximum(HIT * gaussians.scales.amax(1), NEAR * depth)
+    hits = rows & (depth > 0) & (apart < reach) & (gaussians.opacities > SEEN)
+    score = torch.where(hits, depth + apart, torch.inf)
+    return int(score.argmin()) if bool(hits.any()) else None
