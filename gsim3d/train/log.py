@@ -10,6 +10,7 @@ import resource
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from gsim3d.effects.plan import Plan
 from gsim3d.errors import InputError
 from gsim3d.io.plain import is_number
 from gsim3d.simulator import Simulator
+from gsim3d.state import Gaussians, Particles
 from gsim3d.train.config import DataConfig, PhaseConfig
 from gsim3d.train.samples import context_cameras, spread_views, subsampled
 
@@ -41,11 +43,13 @@ class Log:
         file: lines of JSON.
         writes: whether this process is the one that writes.
         board: TensorBoard while it is open, or None.
+        wandb: Weights & Biases while it is open, or None.
     """
 
     def __init__(self, out: Path, *, writes: bool = True):
         self.file, self.writes = out / LOG, writes
         self.board: Board | None = None
+        self.wandb: Wandb | None = None
         self._stream = None
 
     def cut(self, step: int) -> None:
@@ -72,19 +76,20 @@ class Log:
             raise InputError(f"{self.file}: cannot be cut to step {step}: {error.strerror}") from None
 
     @contextmanager
-    def opened(self, *, tensorboard: bool) -> Iterator[None]:
-        """Within it steps are written; with ``tensorboard``, for it as well."""
+    def opened(self, *, tensorboard: bool = False, wandb: dict | None = None) -> Iterator[None]:
+        """Within it steps are written; also for TensorBoard, and with the settings ``wandb`` for Weights & Biases."""
         if not self.writes:
             yield
             return
         with open(self.file, "a") as self._stream:
             self.board = Board(self.file.parent / BOARD) if tensorboard else None
+            self.wandb = None if wandb is None else Wandb(self.file.parent, wandb)
             try:
                 yield
             finally:
-                if self.board is not None:
-                    self.board.close()
-                self.board = self._stream = None
+                for logger in filter(None, (self.board, self.wandb)):
+                    logger.close()
+                self.board = self.wandb = self._stream = None
 
     def write(self, entry: dict, machine: dict) -> None:
         """Writes ``entry``, which follows from the configuration, and time and memory, which do not."""
@@ -97,8 +102,43 @@ class Log:
                 raise InputError(
                     f"{self.file}: cannot be written: {error.strerror}; free some space and train again"
                 ) from None
-            if self.board is not None:
-                self.board.scalars({**entry, **machine}, entry["step"])
+            for logger in filter(None, (self.board, self.wandb)):
+                logger.scalars(dict(_numbers({**entry, **machine}, "train")), entry["step"])
+
+
+def _numbers(values: dict, prefix: str) -> Iterator[tuple[str, float]]:
+    """Name and value of all numbers of ``values``, nested ones and those of lists under their own names."""
+    for name, value in values.items():
+        if isinstance(value, list):
+            value = {str(i + 1): item for i, item in enumerate(value)}
+        if isinstance(value, dict):
+            yield from _numbers(value, f"{prefix}/{name}")
+        elif isinstance(value, (int, float)) and name != "step":
+            yield f"{prefix}/{name}", value
+
+
+class Wandb:
+    """A run of Weights & Biases with the settings ``config``; its environment variables say where it goes.
+
+    Raises:
+        InputError: the package is not installed, or no run can be started.
+    """
+
+    def __init__(self, out: Path, config: dict):
+        try:
+            import wandb
+        except ImportError:
+            raise InputError("--wandb needs the package wandb: pip install 'gsim3d[wandb]'") from None
+        try:
+            self._run = wandb.init(project="gsim3d", name=out.resolve().name, dir=str(out), config=config)
+        except wandb.Error as error:
+            raise InputError(f"--wandb: {error}; WANDB_MODE=offline needs no account") from None
+
+    def scalars(self, values: dict[str, float], step: int) -> None:
+        self._run.log(values, step=step)
+
+    def close(self) -> None:
+        self._run.finish()
 
 
 class Board:
@@ -111,15 +151,9 @@ class Board:
             raise InputError("--tensorboard needs the package tensorboard: pip install 'gsim3d[tensorboard]'") from None
         self._writer = SummaryWriter(str(folder))
 
-    def scalars(self, values: dict, step: int, prefix: str = "train") -> None:
-        """All numbers of ``values``, nested ones and those of lists under their own names."""
+    def scalars(self, values: dict[str, float], step: int) -> None:
         for name, value in values.items():
-            if isinstance(value, list):
-                value = {str(i + 1): item for i, item in enumerate(value)}
-            if isinstance(value, dict):
-                self.scalars(value, step, f"{prefix}/{name}")
-            elif isinstance(value, (int, float)) and name != "step":
-                self._writer.add_scalar(f"{prefix}/{name}", value, step)
+            self._writer.add_scalar(name, value, step)
 
     def video(self, frames: Tensor, step: int) -> None:
         """Shows ``frames``, uint8 [T, H, W, 3]."""
@@ -139,25 +173,56 @@ class Board:
         self._writer.close()
 
 
+@dataclass(frozen=True)
+class Sample:
+    """A prediction of the first window of a scene.
+
+    Attributes:
+        particles: one cloud a step.
+        gaussians: as they are rendered.
+        n_given: steps that were encoded.
+        scene: recorded; its steps from 0.
+        cam: whose images are compared.
+    """
+
+    particles: Particles
+    gaussians: Gaussians
+    n_given: int
+    scene: Scene
+    cam: int
+
+
 @torch.no_grad()
-def sample_video(
+def draw_sample(
     simulator: Simulator, plan: Plan, scene: Scene, data: DataConfig, phase: PhaseConfig, device: str
-) -> Tensor:
-    """uint8 [T, H, 2 W, 3]: the first window of ``scene`` seen by one camera, recorded and predicted."""
-    n_past = phase.history or data.history
-    steps, cams = range(n_past + phase.horizon), context_cameras(scene, data)
-    views = spread_views(cams, data.context_views, 0)
-    frames = make_frames([scene], [views], [list(steps[:n_past])])
-    simulator.eval()
-    try:
+) -> Sample:
+    """What ``simulator`` predicts of the first window of ``scene`` now."""
+    n_past, cams = phase.history or data.history, context_cameras(scene, data)
+    frames = make_frames([scene], [spread_views(cams, data.context_views, 0)], [list(range(n_past))])
+    with _evaluating(simulator):
         state = simulator.encode(subsampled(frames, data).to(device), on_invalid="drop")
         if phase.horizon:
             state = concatenate([state, *simulator.rollout(state, phase.horizon, plan, on_invalid="drop")])
-        cameras = scene.cameras_at(cams[:1], steps).to(device)
-        predicted = simulator.render(state, cameras, plan=plan, on_invalid="drop").color
+        return Sample(state, simulator.renderer(state, sh_degree=plan.sh_degree), n_past, scene, cams[0])
+
+
+@contextmanager
+def _evaluating(simulator: Simulator) -> Iterator[None]:
+    simulator.eval()
+    try:
+        yield
     finally:
         simulator.train()
-    recorded = scene.images(cams[:1], steps)[:, 0].permute(0, 2, 3, 1)
+
+
+@torch.no_grad()
+def sample_video(simulator: Simulator, plan: Plan, sample: Sample) -> Tensor:
+    """uint8 [T, H, 2 W, 3]: a sample seen by its camera, recorded and predicted."""
+    scene, steps, particles = sample.scene, range(sample.particles.n_clouds), sample.particles
+    cameras = scene.cameras_at([sample.cam], steps).to(particles.means.device)
+    with _evaluating(simulator):
+        predicted = simulator.render(particles, cameras, plan=plan, on_invalid="drop").color
+    recorded = scene.images([sample.cam], steps)[:, 0].permute(0, 2, 3, 1)
     return torch.cat([recorded, (predicted.clamp(0, 1) * 255).round().to(torch.uint8).cpu()], 2)
 
 

@@ -38,7 +38,17 @@ from gsim3d.train.gradients import (
     recomputing,
     total_norm,
 )
-from gsim3d.train.log import Log, check_profile, memory_gib, plain, profiler, progress_note, sample_video
+from gsim3d.train.log import (
+    Log,
+    Sample,
+    check_profile,
+    draw_sample,
+    memory_gib,
+    plain,
+    profiler,
+    progress_note,
+    sample_video,
+)
 from gsim3d.train.losses import time_weights, training_loss
 from gsim3d.train.optimizer import FIRST_SCALE, LossScale, Optimizer, deterministic, one_cycle, update_average
 from gsim3d.train.processes import Processes
@@ -121,6 +131,8 @@ class Trainer:
         end: float = math.inf,
         progress: bool = True,
         tensorboard: bool = False,
+        wandb: bool = False,
+        watch: Callable[[Sample, int], None] | None = None,
         profile: bool = False,
     ) -> None:
         """Trains to the end of the configuration, or to optimizer step ``until``, and saves there.
@@ -130,6 +142,8 @@ class Trainer:
             end: on the clock of time.monotonic; then it saves and stops. For one process.
             progress: show a progress bar.
             tensorboard: also log for TensorBoard, with a sample video at each checkpoint.
+            wandb: also log for Weights & Biases.
+            watch: called by the first process with a sample and the step, before the first step and at each checkpoint.
             profile: write a trace of two steps.
         Raises:
             NumericalError: ``optimizer.max_skipped`` steps in a row were skipped; the message says what to do.
@@ -145,9 +159,13 @@ class Trainer:
             check_profile(until - self.step)
         tracer = profiler(self.out, self.processes.rank) if profile else nullcontext()
         lock = only_one_writer(self.out) if self.processes.is_first else nullcontext()
-        log, signals = self.log.opened(tensorboard=tensorboard), noted_signals()
+        config = describe(self.config, self.simulator.config, self.scenes[0], self.effects) if wandb else None
+        log, signals = self.log.opened(tensorboard=tensorboard, wandb=config), noted_signals()
+        watch = watch if self.processes.is_first else None
         with lock, bar, deterministic(), log, tracer, signals as self._signals:
             stops = self.step >= until
+            if watch is not None:
+                watch(self.draw_sample(), self.step)
             while not stops:
                 start = time.perf_counter()
                 entry = self.train_step()
@@ -166,8 +184,7 @@ class Trainer:
                 stops = self.step == until or time.monotonic() >= end or self._stop is not None
                 if self.step % self.config.checkpoint_every == 0 or stops:
                     self.save()
-                    if self.log.board is not None:
-                        self.log.board.video(self.sample_video(), self.step)
+                    self._show(watch)
         self.processes.check_same(weights=self.parameters.values())  # all wait until the first one has saved
         if self._stop is not None and self.step < until:
             why, code = self._stop
@@ -379,10 +396,20 @@ class Trainer:
         watch.report.close()  # what the backward pass computes again would be counted twice
         return images
 
-    def sample_video(self) -> Tensor:
-        """uint8 [T, H, 2 W, 3]: the first window of the first scene seen by one camera, recorded and predicted."""
-        phase, _ = self.config.phase_of(min(self.step, self.config.n_steps) - 1)
-        return sample_video(self.simulator, self.plan, self.scenes[0], self.config.data, phase, self.device)
+    def draw_sample(self) -> Sample:
+        """What is predicted of the first window of the first scene now."""
+        phase, _ = self.config.phase_of(max(0, min(self.step, self.config.n_steps) - 1))
+        return draw_sample(self.simulator, self.plan, self.scenes[0], self.config.data, phase, self.device)
+
+    def _show(self, watch: Callable[[Sample, int], None] | None) -> None:
+        """A sample for those that look on."""
+        if self.log.board is None and watch is None:
+            return
+        sample = self.draw_sample()
+        if self.log.board is not None:
+            self.log.board.video(sample_video(self.simulator, self.plan, sample), self.step)
+        if watch is not None:
+            watch(sample, self.step)
 
     # ---- checkpoints ----
 

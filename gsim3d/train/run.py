@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from gsim3d.cuda_graphs import is_out_of_memory
@@ -13,6 +13,7 @@ from gsim3d.io import checkpoint
 from gsim3d.io.files import with_parents
 from gsim3d.io.locks import only_one_writer
 from gsim3d.train.config import TrainConfig
+from gsim3d.train.log import Sample
 from gsim3d.train.loop import Trainer
 from gsim3d.train.processes import joined
 
@@ -27,6 +28,8 @@ def train(
     until: int | None = None,
     export: str | Path | None = None,
     tensorboard: bool = False,
+    wandb: bool = False,
+    viewer: Callable[[], AbstractContextManager[Callable[[Sample, int], None]]] | None = None,
     profile: bool = False,
 ) -> None:
     """Trains on the scenes in ``folders`` and writes the run folder ``out``.
@@ -37,6 +40,8 @@ def train(
         until: optimizer step to stop after; None: the last one.
         export: .safetensors file for the result; None: none.
         tensorboard: also log to OUT/tensorboard.
+        wandb: also log for Weights & Biases.
+        viewer: opens what is to be called with samples, see :meth:`gsim3d.train.loop.Trainer.run`.
         profile: write a trace of two steps to OUT/profile.
     Raises:
         InputError: scenes do not fit the settings, or the memory is full.
@@ -54,8 +59,10 @@ def train(
                 "" if trainer.same_scenes else "; its scenes have changed, so the curve is another one from here on"
             )
             report(f"going on from step {trainer.step} of {config.n_steps}{changed}")
+        options = {"until": until, "tensorboard": tensorboard, "wandb": wandb, "profile": profile}
         try:
-            trainer.run(until=until, tensorboard=tensorboard, profile=profile)
+            with viewer() if viewer and processes.is_first else nullcontext() as watch:
+                trainer.run(**options, watch=watch)
         except (RuntimeError, MemoryError) as error:
             if not is_out_of_memory(error):
                 raise

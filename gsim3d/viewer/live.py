@@ -26,6 +26,7 @@ AWAKE_COLOR, FROZEN_COLOR, ASLEEP_COLOR = (0.95, 0.5, 0.1), (0.55, 0.55, 0.55), 
 FASTEST = 0.99  # quantile of the speeds that has the last colour
 LATENT_RANGE = 0.02  # quantile of the latents that is black; as many are at full brightness
 KEPT_FRAMES = 128
+Frames = Sequence[Gaussians]
 HELD = (3e-4, 200.0)  # standard deviations whose squares are neither 0 nor infinite in half precision
 SPEEDS = (0.1, 4.0)  # of the timeline, relative to real time
 SIZES = (0.05, 1.0)  # of the drawn Gaussians, relative to their own
@@ -160,8 +161,7 @@ class Target:
         name: str,
         fps: float,
         *,
-        n_frames: int = 0,
-        read: Callable[[int], Gaussians] | None = None,
+        frames: Frames = (),
         draw: Callable[[Particles], Gaussians] | None = None,
         particles: Sequence[Particles] = (),
         scene: Scene | None = None,
@@ -170,17 +170,16 @@ class Target:
     ):
         """
         Args:
-            n_frames: of ``read``.
-            read: Gaussians of a frame; None: they are drawn from ``particles``, or there are none.
+            frames: Gaussians of each; empty: they are drawn from ``particles``, or there are none.
             draw: Gaussians of particles.
         """
         self.name, self.fps, self.scene, self.first, self.n_encoded = name, fps, scene, first, n_encoded
-        self._read, self._draw, self._n_read = read, draw, n_frames
-        self.replace(particles)
+        self._draw = draw
+        self.replace(particles, frames)
 
-    def replace(self, particles: Sequence[Particles]) -> None:
-        """Shows other particles from now on."""
-        self.particles = list(particles)
+    def replace(self, particles: Sequence[Particles], frames: Frames = ()) -> None:
+        """Shows other particles from now on, and the Gaussians ``frames`` where they are not drawn."""
+        self.particles, self._frames = list(particles), frames
         self.gaussians = functools.lru_cache(KEPT_FRAMES)(self._gaussians)
         self._fastest: float | None = None
         self._axes: tuple[Tensor, Tensor, Tensor] | None = None
@@ -190,13 +189,13 @@ class Target:
         if self.particles and self._draw is not None:
             with torch.no_grad():
                 return self._draw(self.particles[frame]).to("cpu")
-        return None if self._read is None else self._read(frame)
+        return self._frames[frame] if len(self._frames) else None
 
     @property
     def n_frames(self) -> int:
         """Number of frames: of particles, of files, or else of the recording."""
-        if self.particles or self._n_read:
-            return len(self.particles) or self._n_read
+        if self.particles or len(self._frames):
+            return len(self.particles) or len(self._frames)
         return 0 if self.scene is None else self.scene.n_steps - self.first
 
     @property

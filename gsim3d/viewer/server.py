@@ -8,6 +8,7 @@ import io
 import socket
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -15,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from gsim3d.errors import InputError, NumericalError
+from gsim3d.state import Gaussians, Particles
 from gsim3d.viewer.live import SIZES, SPEEDS, Layers, Target, Timeline, splatting_of, unit_of
 from gsim3d.viewer.panel import SimulationPanel
 from gsim3d.viewer.simulation import Simulation
@@ -76,6 +78,7 @@ class Viewer:
         first = target.gaussians(0)
         self._unit = 1.0 if first is None else unit_of(first)
         self._splats, self._frusta, self._closed = None, {}, threading.Event()
+        self._note, self._next = "", deque(maxlen=1)
         with contextlib.redirect_stdout(io.StringIO()):  # its banner
             self.server = viser.ViserServer(host, free_port(host, port), label=f"gsim3d: {target.name}", verbose=False)
         self.address = f"http://{LOCAL if host == PUBLIC else host}:{self.server.get_port()}"
@@ -103,10 +106,24 @@ class Viewer:
         while not self._closed.wait(1):
             pass
 
+    def show(self, particles: list[Particles], frames: list[Gaussians], note: str) -> None:
+        """Shows other frames of the same scene soon; returns at once.
+
+        Args:
+            particles: of each frame.
+            frames: their Gaussians.
+            note: shown before the time.
+        """
+        self._next.append((particles, frames, note))
+
     def _run(self) -> None:
         before = time.monotonic()
         while not self._closed.wait(TICK):
             with self._lock:
+                if self._next:
+                    particles, frames, self._note = self._next.pop()
+                    self._target.replace(particles, frames)
+                    self._frames_changed()
                 now = time.monotonic()
                 if self.timeline.advance(now - before):
                     self.draw()
@@ -151,7 +168,7 @@ class Viewer:
                 box = gui.add_checkbox(name, True)
                 self.on(box, partial(self._change_layer, name, box))
             if target.gaussians(0) is not None:
-                coloring = gui.add_dropdown("Colours", target.colorings)
+                self._coloring = coloring = gui.add_dropdown("Colours", target.colorings)
                 size = gui.add_slider("Size", *SIZES, 0.05, 1.0, hint="of the drawn Gaussians")
                 self.on(coloring, partial(self._change_layer, "coloring", coloring))
                 self.on(size, partial(self._change_layer, "size", size))
@@ -183,6 +200,9 @@ class Viewer:
         self.timeline.resize(self._target.n_frames)
         self._frame.max = max(self.timeline.n_frames - 1, 1)
         self._frame.disabled = self._play.disabled = self.timeline.n_frames < 2
+        if self._coloring.options != self._target.colorings:
+            self._coloring.options = self._target.colorings
+            self.layers = dataclasses.replace(self.layers, coloring=self._coloring.value)
         self.draw()
 
     def on(self, handle: Any, act: Callable[..., Any], event: str = "on_update") -> None:
@@ -243,7 +263,8 @@ class Viewer:
 
     def _description(self, frame: int, count: int) -> str:
         given = " (input)" if frame < self._target.n_encoded else ""
-        text = f"{frame / self.timeline.fps:.2f} s, frame {frame} of {self.timeline.n_frames}{given}"
+        text = f"{self._note}, " if self._note else ""
+        text += f"{frame / self.timeline.fps:.2f} s, frame {frame} of {self.timeline.n_frames}{given}"
         text += f", {count:,} Gaussians" if count else ""
         if self._simulation is not None:
             text += f", {1000 * self._simulation.seconds_a_step:.0f} ms a simulated step"

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
 from gsim3d.data import Scene, layouts
 from gsim3d.errors import InputError
-from gsim3d.io.sequence import GAUSSIANS, open_sequence
+from gsim3d.io.sequence import GAUSSIANS, Sequence, open_sequence
 from gsim3d.state import Gaussians
 from gsim3d.viewer.live import Target
 
@@ -46,18 +47,27 @@ def open_target(
     if recorded is None and start:
         raise InputError(f"--start {start}: {path} has no such step without --scene")
 
-    def read(frame: int) -> Gaussians:
-        gaussians = sequence[frame]
-        return gaussians if recorded is None else _in_axes_of(recorded, gaussians)
-
     return Target(
         path.resolve().name,
         fps or sequence.fps or (FPS if recorded is None else recorded.fps),
-        n_frames=len(sequence),
-        read=read,
+        frames=sequence if recorded is None else _InAxesOf(recorded, sequence),
         scene=recorded,
         first=0 if recorded is None else _checked(recorded, start),
     )
+
+
+@dataclass(frozen=True)
+class _InAxesOf:
+    """Frames of a sequence, read when they are asked for, with positions that count from where a scene's do."""
+
+    scene: Scene
+    sequence: Sequence
+
+    def __len__(self) -> int:
+        return len(self.sequence)
+
+    def __getitem__(self, frame: int) -> Gaussians:
+        return _in_axes_of(self.scene, self.sequence[frame])
 
 
 def _is_scene(folder: Path) -> bool:

@@ -3,7 +3,10 @@
 import dataclasses
 import json
 import math
+import re
 import sys
+import types
+import urllib.request
 
 import pytest
 import torch
@@ -13,9 +16,12 @@ from gsim3d.io import checkpoint
 from gsim3d.io.settings import from_dict
 from gsim3d.train.config import DataConfig, PhaseConfig, PrecisionConfig
 from gsim3d.train.gradients import StepWatch
+from gsim3d.train.log import sample_video
 from gsim3d.train.loop import Trainer, deterministic
 from gsim3d.train.optimizer import STEPS_TO_DOUBLE, LossScale
 from gsim3d.train.samples import draw_batch, draw_windows
+from gsim3d.viewer import training
+from gsim3d.viewer.training import showing_samples
 from tests.tiny_scenes import write_scenes
 from tests.train.test_loop import CONFIG, curve, scenes
 
@@ -155,18 +161,85 @@ def test_tensorboard_gets_all_numbers_and_videos_and_changes_no_bit(folder, tmp_
     assert video.step == 5 and (video.width, video.height) == (64, 32) and video.encoded_image_string[:3] == b"GIF"
 
 
-def test_tensorboard_that_is_not_installed_is_named(folder, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
-    with pytest.raises(InputError, match=r"pip install 'gsim3d\[tensorboard\]'"):
-        Trainer(CONFIG, scenes(folder), tmp_path).run(progress=False, tensorboard=True)
+class FakeWandb(types.ModuleType):
+    """Records what is logged."""
+
+    Error = RuntimeError
+
+    def __init__(self):
+        super().__init__("wandb")
+        self.started, self.logged, self.n_finished = [], [], 0
+
+    def init(self, **options):
+        self.started.append(options)
+        return self
+
+    def log(self, values, step):
+        self.logged.append((step, values))
+
+    def finish(self):
+        self.n_finished += 1
+
+
+def test_wandb_gets_what_tensorboard_gets_and_the_settings(folder, tmp_path, monkeypatch):
+    fake = FakeWandb()
+    monkeypatch.setitem(sys.modules, "wandb", fake)
+    for name in ("without", "with"):
+        Trainer(CONFIG, scenes(folder), tmp_path / name).run(progress=False, until=3, wandb=name == "with")
+    assert curve(tmp_path / "without") == curve(tmp_path / "with")
+    (options,) = fake.started
+    assert options["dir"] == str(tmp_path / "with") and options["config"]["train"]["seed"] == CONFIG.seed
+    losses = [(step, values["train/loss"]) for step, values in fake.logged]
+    assert losses == [(line["step"], line["loss"]) for line in curve(tmp_path / "with")] and fake.n_finished == 1
+    assert {"train/step_seconds", "train/grad_norm_by_module/encoder"} <= set(fake.logged[0][1])
+
+
+@pytest.mark.parametrize("name, option", [("torch.utils.tensorboard", "tensorboard"), ("wandb", "wandb")])
+def test_loggers_that_are_not_installed_are_named(folder, tmp_path, monkeypatch, name, option):
+    monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(InputError, match=rf"pip install 'gsim3d\[{option}\]'"):
+        Trainer(CONFIG, scenes(folder), tmp_path).run(progress=False, **{option: True})
 
 
 def test_sample_video_shows_truth_and_prediction(folder, tmp_path):
     trainer = trainer_at(folder, tmp_path)
-    video = trainer.sample_video()
+    video = sample_video(trainer.simulator, trainer.plan, trainer.draw_sample())
     assert video.shape == (4, 32, 64, 3) and video.dtype == torch.uint8 and trainer.simulator.training
     assert torch.equal(video[:, :, :32], trainer.scenes[0].images([0], range(4))[:, 0].permute(0, 2, 3, 1))
     assert video[:, :, 32:].float().std() > 1
+
+
+def test_viewer_shows_each_sample_and_changes_no_bit(folder, tmp_path, capsys):
+    pytest.importorskip("viser", reason="needs viser")
+    config = dataclasses.replace(CONFIG, checkpoint_every=2)
+    Trainer(config, scenes(folder), tmp_path / "without").run(progress=False, until=5)
+    shown = []
+    with showing_samples() as show:
+
+        def watch(sample, step):
+            show(sample, step)
+            shown.append((step, sample.particles.n_clouds, sample.n_given))
+
+        Trainer(config, scenes(folder), tmp_path / "with").run(progress=False, until=5, watch=watch)
+        address = re.search(r"viewer: (http://127.0.0.1:\d+)", capsys.readouterr().out)[1]
+        with urllib.request.urlopen(address) as answer:
+            assert answer.status == 200
+    assert curve(tmp_path / "without") == curve(tmp_path / "with")
+    assert [step for step, *_ in shown] == [0, 2, 4, 5] and shown[0][1:] == (1, 1) and shown[-1][1:] == (4, 2)
+
+
+def test_training_goes_on_without_a_viewer_that_fails(folder, tmp_path, monkeypatch):
+    pytest.importorskip("viser", reason="needs viser")
+    calls = []
+
+    def fails(*_):
+        calls.append(1)
+        raise OSError("no port")
+
+    monkeypatch.setattr(training, "Viewer", fails)
+    with showing_samples() as show, pytest.warns(UserWarning, match="given up at step 0: OSError: no port"):
+        Trainer(CONFIG, scenes(folder), tmp_path).run(progress=False, until=3, watch=show)
+    assert len(curve(tmp_path)) == 3 and len(calls) == 1
 
 
 def test_a_trace_is_written_and_changes_no_bit(folder, tmp_path):

@@ -55,7 +55,7 @@ def falling(n_frames=4):
 
 
 def target_of(frames, **options) -> Target:
-    return Target("falling", 10.0, n_frames=len(frames), read=frames.__getitem__, **options)
+    return Target("falling", 10.0, frames=frames, **options)
 
 
 @pytest.fixture(scope="module")
