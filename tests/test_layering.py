@@ -36,7 +36,7 @@ RINGS = {
         simulator
     """,
     "workshop": """
-        data evaluate.perceptual
+        data evaluate.perceptual planning
         evaluate.metrics
         compat
         train

@@ -15,6 +15,8 @@ ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "gsim3d"
 LIBRARY = ("ops", "nn", "dynamics", "priors", "effects", "numerics", "math", "pretrained")  # folders of the inner ring
 FORMATS = ("io", "viewer")
+# Of the package: its core, readers and viewer, kernels of other projects' users, actions and planning.
+PACKAGE_LIMIT = 22_500 + 2_200 + 900 + 1_800
 
 
 class Size(NamedTuple):
@@ -53,7 +55,7 @@ def sizes() -> list[Size]:
     words = sum(len(page.read_text().split()) for page in pages)
     forward = dict(_functions(PACKAGE / "dynamics" / "model.py")).get("Dynamics.forward", 0)
     return [
-        Size("lines of the package", _lines(_python(PACKAGE)), 24_700),
+        Size("lines of the package", _lines(_python(PACKAGE)), PACKAGE_LIMIT),
         Size("lines of the library without io", _lines(library), 10_000),
         Size("lines of readers, writers and the viewer", _lines(_python(*(PACKAGE / name for name in FORMATS))), 2_800),
         Size("lines of gsim3d/profile", _lines(_python(PACKAGE / "profile")), 1_600),

@@ -1,0 +1,139 @@
+"""Planners against the linear-quadratic regulator, and what all of them promise."""
+
+import math
+
+import pytest
+import torch
+
+from gsim3d.errors import InputError, NumericalError
+from gsim3d.planning import CEM, MPPI, GradientDescent
+from gsim3d.planning.planners import colored_noise, softmin
+
+PLANNERS = {"mppi": MPPI, "cem": CEM, "gradient": GradientDescent}
+HORIZON, DT, CONTROL_WEIGHT = 15, 0.2, 0.1
+A = torch.tensor([[1.0, DT], [0.0, 1.0]], dtype=torch.float64)
+B = torch.tensor([[DT**2 / 2], [DT]], dtype=torch.float64)
+START = torch.tensor([1.0, 0.0], dtype=torch.float64)
+LOW, HIGH = torch.tensor([-4.0], dtype=torch.float64), torch.tensor([4.0], dtype=torch.float64)
+
+
+def double_integrator(state, actions):
+    """States [K, H, 2] after each action: position and velocity."""
+    current, states = state.expand(len(actions), 2), []
+    for step in range(actions.shape[1]):
+        current = current @ A.T + actions[:, step] @ B.T
+        states.append(current)
+    return torch.stack(states, 1)
+
+
+def quadratic(states, actions):
+    return states.square().sum((1, 2)) + CONTROL_WEIGHT * actions.square().sum((1, 2))
+
+
+def lqr_cost():
+    """Cost of the optimal sequence from START, by the Riccati recursion."""
+    value = torch.zeros(2, 2, dtype=torch.float64)
+    for _ in range(HORIZON):
+        later = torch.eye(2, dtype=torch.float64) + value
+        gain = torch.linalg.solve(CONTROL_WEIGHT + B.T @ later @ B, B.T @ later @ A)
+        value = A.T @ later @ (A - B @ gain)
+    return float(START @ value @ START)
+
+
+def planner(kind, dynamics=double_integrator, cost=quadratic, **options):
+    return PLANNERS[kind](dynamics, cost, LOW, HIGH, **{"horizon": HORIZON, **options})
+
+
+@pytest.mark.parametrize("kind", PLANNERS)
+def test_double_integrator_costs_at_most_five_percent_more_than_lqr(kind):
+    settings = {"mppi": {"iterations": 30}, "cem": {"iterations": 15}, "gradient": {"iterations": 100}}
+    plan = planner(kind, samples=256, color=0.5, **settings[kind]).plan(START)
+    assert 0.999 * lqr_cost() <= plan.cost <= 1.05 * lqr_cost()
+    assert plan.cost == pytest.approx(
+        float(quadratic(double_integrator(START, plan.actions[None]), plan.actions[None]))
+    )
+
+
+@pytest.mark.parametrize("kind", PLANNERS)
+def test_closed_loop_with_warm_starts_reaches_the_origin(kind):
+    agent, state = planner(kind, samples=64), START
+    for _ in range(30):
+        state = double_integrator(state, agent.plan(state).actions[None, :1])[0, -1]
+    assert state.norm() < 0.1
+
+
+@pytest.mark.parametrize("kind", PLANNERS)
+def test_plans_do_not_depend_on_chunks_and_are_functions_of_the_seed(kind):
+    plans = [planner(kind, chunk=chunk, seed=3).plan(START) for chunk in (None, 1, 7, 64)]
+    assert all(torch.equal(plans[0].actions, other.actions) for other in plans[1:])
+    assert not torch.equal(plans[0].actions, planner(kind, seed=4).plan(START).actions)
+    agent = planner(kind, seed=3)
+    first = agent.plan(START)
+    agent.plan(START)
+    agent.reset()
+    assert torch.equal(agent.plan(START).actions, first.actions)
+
+
+@pytest.mark.parametrize("kind", PLANNERS)
+def test_lowest_cost_never_rises_and_actions_stay_inside_bounds(kind):
+    # The cost pulls beyond the upper bound.
+    plan = planner(kind, cost=lambda states, actions: -actions.sum((1, 2))).plan(START)
+    assert len(plan.history) >= 1 and all(b <= a for a, b in zip(plan.history, plan.history[1:]))
+    assert plan.history[-1] == plan.cost
+    assert plan.actions.shape == (HORIZON, 1) and (plan.actions >= LOW).all() and (plan.actions <= HIGH).all()
+    assert plan.actions.mean() > 0.8 * HIGH.item()
+
+
+@pytest.mark.parametrize("kind", PLANNERS)
+def test_sequences_without_a_finite_cost_are_never_chosen(kind):
+    def cost(states, actions):
+        return torch.where(actions[:, 0, 0] > 0, math.nan, quadratic(states, actions))
+
+    assert planner(kind, cost=cost).plan(START).actions[0, 0] <= 0
+    with pytest.raises(NumericalError, match="no sequence of actions has a finite cost"):
+        planner(kind, cost=lambda states, actions: actions[:, 0, 0] * math.nan).plan(START)
+
+
+@pytest.mark.parametrize(
+    "options, words",
+    [
+        ({"horizon": 0}, "horizon must be at least 1"),
+        ({"samples": 0}, "samples must be at least 1"),
+        ({"chunk": 0}, "chunk must be at least 1"),
+        ({"noise": -1.0}, "noise must be positive"),
+        ({"temperature": 0.0}, "temperature must be positive"),
+        ({"effective_share": 1.0}, "effective_share"),
+    ],
+)
+def test_wrong_options_are_refused(options, words):
+    with pytest.raises(InputError, match=words):
+        planner("mppi", **options)
+
+
+def test_wrong_bounds_and_costs_are_refused():
+    with pytest.raises(InputError, match="low below high"):
+        MPPI(double_integrator, quadratic, HIGH, LOW)
+    with pytest.raises(InputError, match="one value a sequence"):
+        planner("mppi", cost=lambda states, actions: states).plan(START)
+
+
+def test_softmin_reaches_the_effective_sample_size():
+    costs = torch.rand(100, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    for effective in (2.0, 10.0, 50.0):
+        weights = softmin(costs, None, effective)
+        assert weights.sum().item() == pytest.approx(1) and 1 / weights.square().sum().item() == pytest.approx(
+            effective
+        )
+        assert torch.equal(weights.argsort(descending=True), costs.argsort())
+    assert torch.equal(softmin(torch.tensor([2.0, 2.0]).double(), None, 1.0), torch.tensor([0.5, 0.5]).double())
+    assert softmin(torch.tensor([0.0, math.inf]).double(), 1.0, 1.0).tolist() == [1.0, 0.0]
+
+
+@pytest.mark.parametrize("n", [1, 2, 9, 10])
+@pytest.mark.parametrize("color", [0.0, 1.0, 2.0])
+def test_colored_noise_has_unit_variance_and_more_slow_than_fast_waves(n, color):
+    noise = colored_noise((20_000, n), color, torch.Generator().manual_seed(1))
+    assert noise.square().mean().item() == pytest.approx(1, rel=0.05)
+    if n > 2 and color:
+        power = torch.fft.rfft(noise).abs().square().mean(0)
+        assert (power[1:].diff() < 0).all()
