@@ -42,7 +42,7 @@ RINGS = {
         train
         viewer
         synth
-        evaluate
+        evaluate envs
         testing
         profile
     """,

@@ -48,7 +48,7 @@ class Plan:
 class Planner(ABC):
     """Base of the planners: bounds, evaluation in chunks, the best sequence, and warm starts.
 
-    ``plan`` is called once a control step. The second call begins with the result of the first, shifted by one action.
+    Each call of ``plan`` begins with the result of the last, without the actions that were executed in between.
 
     Args:
         dynamics: see the module.
@@ -102,24 +102,28 @@ class Planner(ABC):
     def reset(self) -> None:
         """Forgets earlier plans and restarts the random numbers: the state of a new planner."""
         self._generator = torch.Generator().manual_seed(self._seed)
-        self._start: Tensor | None = None
+        self._last = ((self.low + self.high) / 2).expand(self.horizon, -1)
 
-    def plan(self, state: Any) -> Plan:
+    def plan(self, state: Any, executed: int = 1) -> Plan:
         """The best sequence of actions from ``state``.
+
+        Args:
+            state: is passed on to the dynamics.
+            executed: actions of the last plan that were executed; 0: all of it is still ahead.
 
         Raises:
             NumericalError: no sequence has a finite cost.
         """
-        if self._start is None:
-            self._start = ((self.low + self.high) / 2).expand(self.horizon, -1)
-        best = _Best(self._start)
+        if executed < 0:
+            raise InputError(f"executed must be 0 or more; got {executed}")
+        best = _Best(_shifted(self._last, executed))
         with torch.no_grad():
-            self._search(state, best)
-        self._start = _shifted(best.actions)
+            self._search(state, best, executed)
+        self._last = best.actions
         return Plan(best.actions, best.cost, tuple(best.history))
 
     @abstractmethod
-    def _search(self, state: Any, best: _Best) -> None:
+    def _search(self, state: Any, best: _Best, executed: int) -> None:
         """Improves ``best``, which holds the sequence to begin with; calls ``best.end_iteration`` once an iteration."""
 
     def _costs(self, state: Any, actions: Tensor) -> Tensor:
@@ -168,7 +172,7 @@ class MPPI(Planner):
         self.temperature, self.effective_share = temperature, effective_share
         super().__init__(*args, **others)
 
-    def _search(self, state: Any, best: _Best) -> None:
+    def _search(self, state: Any, best: _Best, executed: int) -> None:
         mean, std = best.actions, self._initial_std()
         for iteration in range(self.iterations):
             sequences = self._sample(mean, std / (iteration + 1))
@@ -211,12 +215,11 @@ class CEM(Planner):
 
     def reset(self) -> None:
         super().reset()
-        self._kept: Tensor | None = None
+        self._kept = self.low.new_empty(0, self.horizon, len(self.low))
 
-    def _search(self, state: Any, best: _Best) -> None:
+    def _search(self, state: Any, best: _Best, executed: int) -> None:
         mean, std = best.actions, self._initial_std()
-        kept = mean[None, :0] if self._kept is None else torch.stack([_shifted(one) for one in self._kept])
-        kept = kept.reshape(-1, *mean.shape)
+        kept = _shifted(self._kept, executed)
         count = min(self.samples, max(2, round(self.elite_share * self.samples)))
         for _ in range(self.iterations):
             sequences = torch.cat([self._sample(mean, std), kept])
@@ -245,7 +248,7 @@ class GradientDescent(Planner):
         self.learning_rate = learning_rate
         super().__init__(*args, iterations=iterations, **others)
 
-    def _search(self, state: Any, best: _Best) -> None:
+    def _search(self, state: Any, best: _Best, executed: int) -> None:
         sequences = self._sample(best.actions, self._initial_std())
         best.update(sequences, self._costs(state, sequences))
         scale = self.high - self.low
@@ -282,9 +285,10 @@ class _Best:
         self.history.append(self.cost)
 
 
-def _shifted(actions: Tensor) -> Tensor:
-    """A sequence one step later; the last action is repeated."""
-    return torch.cat([actions[1:], actions[-1:]])
+def _shifted(actions: Tensor, steps: int) -> Tensor:
+    """Sequences [..., H, A] ``steps`` later; the last action is repeated."""
+    horizon = actions.shape[-2]
+    return actions[..., [min(step + steps, horizon - 1) for step in range(horizon)], :]
 
 
 def softmin(costs: Tensor, temperature: float | None, effective: float) -> Tensor:
@@ -322,7 +326,8 @@ def colored_noise(shape: tuple[int, ...], color: float, generator: torch.Generat
     Returns:
         float64 of ``shape``.
 
-    Source: Timmer and Koenig, "On generating power law noise", Astronomy and Astrophysics 300, 1995.
+    Source:
+        Timmer and Koenig, "On generating power law noise", Astronomy and Astrophysics 300, 1995.
     """
     white = torch.randn(shape, dtype=torch.float64, generator=generator)
     if color == 0 or shape[-1] == 1:

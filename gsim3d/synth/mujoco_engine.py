@@ -66,6 +66,10 @@ def model_xml(setup: SceneSetup, timestep: float) -> str:
         soft = any(isinstance(body, SoftBody) for body in setup.bodies)
         height = setup.ground - (CONTACT_RADIUS if soft else 0)
         bodies.append(f'<geom type="plane" size="9 9 .1" pos="0 0 {height:.9g}" {contact}/>')
+    if setup.pusher is not None:
+        place, radius = _numbers(setup.pusher.position), f"{setup.pusher.radius:.9g}"
+        geom = f'<geom type="sphere" size="{radius}"/>'  # friction and softness are the pushed body's
+        bodies.append(f'<body name="pusher" mocap="true" pos="{place}">{geom}</body>')
     iterations = 50 if setup.cloth is None else 100  # a cloth that carries a soft body converges slowly
     return f"""<mujoco>
   <option timestep="{timestep:.12g}" integrator="discrete" iterations="{iterations}" gravity="0 0 {-GRAVITY}"/>
@@ -131,6 +135,12 @@ def _flex_id(model, name: str) -> int:
     return mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_FLEX, name)
 
 
+def body_nodes(data, body: int) -> np.ndarray:
+    """Origin and tips of the unit axes [4, 3] of a rigid body, metres."""
+    origin = data.xpos[body]
+    return np.concatenate([origin[None], origin + data.xmat[body].reshape(3, 3).T])
+
+
 class _Soft:
     def __init__(self, model, data, index: int, body: SoftBody):
         flex = _flex_id(model, f"b{index}")
@@ -170,8 +180,7 @@ class _Rigid:
         self.rest = self.nodes()
 
     def nodes(self) -> np.ndarray:
-        origin = self.data.xpos[self.id]
-        return np.concatenate([origin[None], origin + self.data.xmat[self.id].reshape(3, 3).T])
+        return body_nodes(self.data, self.id)
 
     def embedding(self, nodes: np.ndarray) -> RigidFrame:
         return RigidFrame(nodes)

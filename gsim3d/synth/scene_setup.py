@@ -103,6 +103,19 @@ class Cloth:
 
 
 @dataclass(frozen=True)
+class Pusher:
+    """A sphere that moves as commanded and that nothing else moves.
+
+    Attributes:
+        position: [3] metres, its centre at time 0.
+        radius: metres.
+    """
+
+    position: np.ndarray
+    radius: float
+
+
+@dataclass(frozen=True)
 class SceneSetup:
     """A scene at time 0.
 
@@ -110,11 +123,13 @@ class SceneSetup:
         bodies: soft or rigid.
         ground: height, metres; None: no ground.
         cloth: or None.
+        pusher: or None.
     """
 
     bodies: tuple[SoftBody | RigidBody, ...]
     ground: float | None
     cloth: Cloth | None = None
+    pusher: Pusher | None = None
 
 
 class Unstable(Exception):

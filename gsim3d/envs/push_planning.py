@@ -1,0 +1,83 @@
+"""What planners need for PushToGoal: dynamics over sequences of pusher velocities, and a cost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsim3d.envs.push import MAX_SPEED, bounded_velocity
+from gsim3d.synth.pushing import PUSHER_RADIUS, SIZE, PushSimulation, PushState
+from gsim3d.synth.scene_setup import Unstable
+
+BEHIND = SIZE / 2 + PUSHER_RADIUS  # metres behind the body, seen from the goal, where the pusher should be
+APPROACH = 0.3  # weight of the pusher's distance to that position; small beside the goal's
+FINAL = 2.0  # weight of the last distance to the goal beside the mean
+
+
+@dataclass(frozen=True)
+class PushStates:
+    """Predicted positions of K sequences, metres; not finite where the simulation failed.
+
+    Attributes:
+        centers: [K, H, 2] of the body.
+        pusher: [K, H, 2].
+    """
+
+    centers: Tensor
+    pusher: Tensor
+
+
+class TrueDynamics:
+    """Dynamics for planners: MuJoCo itself, one sequence after the other.
+
+    Args:
+        simulation: of the episode; every call leaves it in the state that was given.
+    """
+
+    def __init__(self, simulation: PushSimulation):
+        self.simulation = simulation
+
+    def __call__(self, state: PushState, actions: Tensor) -> PushStates:
+        """Positions after each of ``actions`` [K, H, 2], m/s, from ``state``."""
+        simulation, shape = self.simulation, tuple(actions.shape)
+        centers, pusher = np.full(shape, np.nan), np.full(shape, np.nan)
+        for k, sequence in enumerate(actions.double().cpu().numpy()):
+            simulation.restore(state)
+            try:
+                for step, action in enumerate(sequence):
+                    simulation.step(bounded_velocity(simulation.pusher[:2], action))
+                    centers[k, step], pusher[k, step] = simulation.centers[0, :2], simulation.pusher[:2]
+            except Unstable:
+                continue
+        simulation.restore(state)
+        return PushStates(torch.from_numpy(centers), torch.from_numpy(pusher))
+
+
+@dataclass(frozen=True)
+class GoalCost:
+    """Cost of PushToGoal: the body's distance to the goal, and the pusher's to the position behind the body.
+
+    ``mean_t |c_t - g| + 2 |c_H - g| + 0.3 mean_t |p_t - b_t|`` with ``b = c + d (c - g) / |c - g|``. Without the last
+    term all sequences that do not reach the body have the same cost.
+
+    Attributes:
+        goal: [2] metres.
+    """
+
+    goal: Tensor
+
+    def __call__(self, states: PushStates, actions: Tensor) -> Tensor:
+        away = states.centers - self.goal.to(states.centers)
+        distance = away.norm(dim=-1)
+        behind = states.centers + BEHIND * away / distance.clamp_min(1e-6)[..., None]
+        approach = (states.pusher - behind).norm(dim=-1).mean(-1)
+        return distance.mean(-1) + FINAL * distance[:, -1] + APPROACH * approach
+
+
+def action_bounds() -> tuple[Tensor, Tensor]:
+    """Lowest and highest action [2], m/s, float64."""
+    high = torch.full((2,), MAX_SPEED, dtype=torch.float64)
+    return -high, high

@@ -1,0 +1,157 @@
+"""Rigid bodies on a ground and a round pusher that moves at commanded velocities, by MuJoCo."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsim3d.errors import InputError
+from gsim3d.synth import meshes, render
+from gsim3d.synth.bodies import name_rng, named_body, named_contact
+from gsim3d.synth.mujoco_engine import body_nodes, model_xml
+from gsim3d.synth.scene_setup import Pusher, RigidBody, SceneSetup, Unstable
+from gsim3d.synth.shapes import icosphere
+from gsim3d.synth.world import Actor
+
+OBJECTS = ("box", "cylinder", "capsule", "spot")  # bodies that lie where they are left
+SIZE = 0.42  # metres, diameter of the sphere that holds a body
+DENSITY = 60.0  # kg/m^3 of the bounding box: light enough for the contacts of a kinematic pusher
+PUSHER_RADIUS, PUSHER_COLOR = 0.08, (0.85, 0.15, 0.1)
+SUBSTEP = 1 / 480  # seconds, the longest
+SETTLE = 0.5  # seconds in which bodies come to rest before an episode begins
+
+
+def draw_body(name: str, position: np.ndarray, angle: float) -> Actor:
+    """A body on the ground; look, size and contacts are functions of its name.
+
+    Args:
+        name: one of ``synth.bodies.OBJECTS``.
+        position: [2] metres, of its centre.
+        angle: radians about the vertical.
+    """
+    body = named_body(name, name_rng(name))
+    c, s = np.cos(angle), np.sin(angle)
+    rotation = SIZE * np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    vertices, collision = body.vertices @ rotation.T, body.collision_vertices @ rotation.T
+    offset = np.array([*position, -collision[:, 2].min()])
+    vertices, collision = vertices + offset, collision + offset
+    mass = DENSITY * float(np.prod(np.ptp(collision, axis=0)))
+    friction, bounce = named_contact(name, (0.4, 0.9), (0.1, 0.7))
+    parts = tuple(meshes.convex_pieces(collision, body.collision_faces))
+    rigid = RigidBody(parts, np.zeros(3), np.zeros(3), mass, friction, bounce)
+    facts = {"object": name, "mass": round(mass, 6), "size": SIZE, "friction": friction, "bounce": bounce}
+    return Actor(rigid, render.Surface(body.faces, body.corners, body.paint), vertices, facts)
+
+
+def pusher_surface() -> tuple[render.Surface, np.ndarray]:
+    """The surface of the pusher and its vertices [V, 3] around its centre, metres."""
+    points, faces = icosphere(2)
+    surface = render.Surface(faces, points[faces], lambda p: np.broadcast_to(PUSHER_COLOR, p.shape))
+    return surface, PUSHER_RADIUS * points
+
+
+@dataclass(frozen=True)
+class PushState:
+    """The full state of a :class:`PushSimulation`, to go back to.
+
+    Attributes:
+        values: float64, MuJoCo's integration state.
+    """
+
+    values: np.ndarray
+
+
+class PushSimulation:
+    """Bodies that a pusher moves over the ground, one frame a step.
+
+    The pusher is a kinematic sphere: it moves exactly as commanded and bodies give way. Equal states and velocities
+    give equal bits.
+
+    Args:
+        bodies: at time 0, above the ground at height 0; they are left to settle for half a second.
+        pusher: its sphere at time 0.
+        fps: frames per second.
+
+    Raises:
+        InputError: ``fps`` is not positive.
+        Unstable: the solver gives up.
+    """
+
+    def __init__(self, bodies: Sequence[RigidBody], pusher: Pusher, fps: float):
+        if not 0 < fps < np.inf:
+            raise InputError(f"fps must be positive; got {fps!r}")
+        os.environ.setdefault("MUJOCO_GL", "disable")
+        import mujoco
+
+        mujoco.set_mju_user_warning(lambda text: None)  # it would write a file into the working directory
+        self._mujoco, self.fps, self.pusher_radius = mujoco, fps, pusher.radius
+        self._substeps = int(np.ceil(1 / (fps * SUBSTEP) - 1e-9))
+        setup = SceneSetup(tuple(bodies), 0.0, pusher=pusher)
+        self._model = mujoco.MjModel.from_xml_string(model_xml(setup, 1 / (fps * self._substeps)))
+        self._data = mujoco.MjData(self._model)
+        self._bodies = [self._model.body(f"b{index}").id for index in range(len(setup.bodies))]
+        self._spec = mujoco.mjtState.mjSTATE_INTEGRATION
+        mujoco.mj_forward(self._model, self._data)
+        self._check()
+        self.rest_nodes = self.nodes()
+        self._advance(np.zeros((int(np.ceil(SETTLE * fps)) * self._substeps, 3)))
+
+    @property
+    def pusher(self) -> np.ndarray:
+        """Centre of the pusher [3], metres."""
+        return self._data.mocap_pos[0].copy()
+
+    @property
+    def centers(self) -> np.ndarray:
+        """Centres of mass of the bodies [B, 3], metres."""
+        return self._data.xipos[self._bodies].copy()
+
+    def nodes(self) -> np.ndarray:
+        """Origin and tips of the unit axes of each body [B, 4, 3], metres; see synth.embedding.RigidFrame."""
+        return np.stack([body_nodes(self._data, body) for body in self._bodies])
+
+    def step(self, velocity: np.ndarray) -> None:
+        """One frame, in which the pusher moves by ``velocity / fps``.
+
+        Args:
+            velocity: [2] m/s, horizontal.
+
+        Raises:
+            InputError: ``velocity`` is not two finite numbers.
+            Unstable: the solver gives up.
+        """
+        velocity = np.asarray(velocity, np.float64)
+        if velocity.shape != (2,) or not np.isfinite(velocity).all():
+            raise InputError(f"velocity must be two finite numbers; got {velocity.tolist()}")
+        moved = np.array([*velocity, 0.0]) / self.fps
+        self._advance(np.arange(1, self._substeps + 1)[:, None] / self._substeps * moved)
+
+    def state(self) -> PushState:
+        """The state now; :meth:`restore` goes back to it."""
+        values = np.empty(self._mujoco.mj_stateSize(self._model, self._spec))
+        self._mujoco.mj_getState(self._model, self._data, values, self._spec)
+        return PushState(values)
+
+    def restore(self, state: PushState) -> None:
+        """Goes back to ``state`` of this simulation, also after it gave up."""
+        for warning in self._data.warning:
+            warning.number = 0
+        self._mujoco.mj_setState(self._model, self._data, state.values, self._spec)
+        self._mujoco.mj_forward(self._model, self._data)
+
+    def _advance(self, offsets: np.ndarray) -> None:
+        """A substep for each offset [S, 3] of the pusher from where it is now."""
+        start = self._data.mocap_pos[0].copy()
+        for offset in offsets:
+            self._data.mocap_pos[0] = start + offset
+            self._mujoco.mj_step(self._model, self._data)
+        self._mujoco.mj_kinematics(self._model, self._data)
+        self._mujoco.mj_comPos(self._model, self._data)
+        self._check()
+
+    def _check(self) -> None:
+        if any(warning.number for warning in self._data.warning) or not np.isfinite(self._data.qpos).all():
+            raise Unstable("the solver gave up")

@@ -1,0 +1,186 @@
+"""Push environments: Gymnasium's own checks, bits by seed, exact actors, and a planner that solves the task."""
+
+import subprocess
+import sys
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+from gsim3d.errors import InputError
+from gsim3d.planning import MPPI
+
+gymnasium = pytest.importorskip("gymnasium", reason="needs gymnasium: pip install 'gsim3d[envs]'")
+pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'gsim3d[envs]'")
+from gymnasium.utils.env_checker import check_env  # noqa: E402
+
+from gsim3d.envs.push import FPS, MAX_SPEED, N_PARTICLES, REACHED, WORKSPACE, PushClear, PushToGoal  # noqa: E402
+from gsim3d.envs.push_planning import GoalCost, TrueDynamics, action_bounds  # noqa: E402
+
+TASKS = ("PushToGoal", "PushClear")
+
+
+def make(task="PushToGoal", **options):
+    return gymnasium.make(f"gsim3d/{task}-v0", **options)
+
+
+def towards_body(env, info):
+    away = info["centers"][0] - env.unwrapped.simulation.pusher[:2]
+    return (MAX_SPEED * away / np.linalg.norm(away)).astype(np.float32)
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("observation", ["particles", "images", "both"])
+def test_gymnasium_finds_no_fault(task, observation):
+    env = make(task, observation=observation, image_size=24, render_mode="rgb_array")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped)
+    observed, _ = env.reset(seed=0)
+    assert ("images" in observed) == (observation != "particles")
+    assert ("particles" in observed) == (observation != "images")
+    assert env.render().shape == (24, 24, 3)
+
+
+def test_an_episode_is_a_function_of_its_seed():
+    episodes = []
+    for seed in (5, 5, 6):
+        env = make()
+        _, info = env.reset(seed=seed)
+        observed = [env.step(towards_body(env, info))[0] for _ in range(6)]
+        episodes.append(observed[-1])
+    assert all(np.array_equal(episodes[0][name], episodes[1][name]) for name in episodes[0])
+    assert not np.array_equal(episodes[0]["particles"], episodes[2]["particles"])
+
+
+def test_pusher_moves_exactly_as_commanded_and_moves_the_body():
+    env = make()
+    _, info = env.reset(seed=3)
+    simulation, before = env.unwrapped.simulation, info["centers"].copy()
+    for _ in range(12):
+        start, action = simulation.pusher, towards_body(env, info)
+        info = env.step(action)[-1]
+        assert np.abs(simulation.pusher[:2] - start[:2] - info["velocity"] / FPS).max() < 1e-15
+        assert np.array_equal(info["velocity"], action.astype(np.float64))
+    assert np.linalg.norm(info["centers"] - before) > 0.05
+
+
+def test_bodies_rest_while_the_pusher_is_away():
+    env = make("PushClear")
+    _, info = env.reset(seed=0)
+    before = info["centers"].copy()
+    for _ in range(6):
+        info = env.step(np.zeros(2, np.float32))[-1]
+    assert len(before) in (2, 3) and np.abs(info["centers"] - before).max() < 1e-3
+
+
+def test_particles_keep_their_distances_as_the_body_moves():
+    env = make()
+    observed, info = env.reset(seed=1)
+    first = observed["particles"]
+    for _ in range(10):
+        observed, *_, info = env.step(towards_body(env, info))
+    assert first.shape == (N_PARTICLES, 3)
+    distances = [np.linalg.norm(p[:, None] - p[None], axis=-1) for p in (first, observed["particles"])]
+    assert np.abs(distances[0] - distances[1]).max() < 1e-5
+
+
+def test_pusher_stops_at_the_edge_of_the_workspace():
+    env = make()
+    env.reset(seed=0)
+    reach = []
+    for _ in range(40):
+        info = env.step(np.array([0.0, -MAX_SPEED], np.float32))[-1]
+        reach.append(np.linalg.norm(env.unwrapped.simulation.pusher[:2]))
+    assert reach[-1] == pytest.approx(WORKSPACE) and max(reach) < WORKSPACE + 1e-9
+    assert abs(info["velocity"][1]) < 0.1 * MAX_SPEED
+
+
+def test_episodes_end_when_solved_or_after_sixty_steps():
+    env = make()
+    env.reset(seed=0)
+    task = env.unwrapped
+    flags = [env.step(np.zeros(2, np.float32))[2:4] for _ in range(60)]
+    assert flags[-1] == (False, True) and not any(any(flag) for flag in flags[:-1])
+    env.reset(seed=0)
+    task.goal = task.simulation.centers[0, :2] + 0.5 * REACHED
+    _, reward, terminated, _, info = env.step(np.zeros(2, np.float32))
+    assert terminated is True and info["is_success"] is True and -REACHED < reward < 0
+
+
+def test_a_cleared_region_is_solved():
+    task = PushClear()
+    task.reset(seed=2)
+    centers = task.simulation.centers[:, :2]
+    assert task._distance(centers) > 0 and not task._solved(centers)
+    assert task._solved(centers / np.linalg.norm(centers, axis=1, keepdims=True))
+
+
+@pytest.mark.parametrize("action", [np.zeros(3), np.array([np.nan, 0]), np.array([2 * MAX_SPEED, 0])])
+def test_wrong_actions_are_refused(action):
+    task = PushToGoal()
+    with pytest.raises(InputError, match="before reset"):
+        task.step(np.zeros(2))
+    task.reset(seed=0)
+    with pytest.raises(InputError, match="action must be two velocities"):
+        task.step(action)
+
+
+@pytest.mark.parametrize("options", [{"observation": "sound"}, {"render_mode": "human"}, {"image_size": 0}])
+def test_wrong_options_are_refused(options):
+    with pytest.raises(InputError, match=next(iter(options))):
+        PushToGoal(**options)
+
+
+def test_missing_gymnasium_is_one_clear_error():
+    code = "import sys; sys.modules['gymnasium'] = None\nimport gsim3d.envs"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert "pip install 'gsim3d[envs]'" in ended.stderr
+
+
+def test_later_actions_change_no_earlier_state():
+    env = make()
+    env.reset(seed=4)
+    simulation = env.unwrapped.simulation
+    state, dynamics = simulation.state(), TrueDynamics(simulation)
+    actions = torch.rand(2, 6, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) - 0.5
+    actions[1, :3] = actions[0, :3]
+    states = dynamics(state, actions)
+    assert torch.equal(states.centers[0, :3], states.centers[1, :3])
+    assert torch.equal(states.pusher[0, :3], states.pusher[1, :3])
+    assert not torch.equal(states.pusher[0, 3:], states.pusher[1, 3:])
+    assert np.array_equal(simulation.state().values, state.values)
+    for step, action in enumerate(actions[0].numpy()):
+        simulation.step(action)
+        assert np.array_equal(simulation.centers[0, :2], states.centers[0, step].numpy())
+
+
+def test_cost_prefers_bodies_at_the_goal_and_pushers_behind_the_body():
+    from gsim3d.envs.push_planning import PushStates
+
+    cost = GoalCost(torch.tensor([1.0, 0.0]))
+    centers = torch.tensor([[[0.9, 0.0]], [[0.5, 0.0]], [[0.5, 0.0]]])
+    pusher = torch.tensor([[[0.6, 0.0]], [[0.2, 0.0]], [[0.8, 0.0]]])
+    values = cost(PushStates(centers, pusher), torch.zeros(3, 1, 2))
+    assert values[0] < values[1] < values[2]
+
+
+def test_a_planner_in_the_truth_solves_an_episode():
+    env = make()
+    _, info = env.reset(seed=1)
+    task = env.unwrapped
+    planner = MPPI(
+        TrueDynamics(task.simulation), GoalCost(torch.from_numpy(task.goal)), *action_bounds(),
+        horizon=8, samples=32, iterations=2, noise=0.3,
+    )  # fmt: skip
+    executed, terminated = 0, False
+    while not terminated:
+        plan = planner.plan(task.simulation.state(), executed)
+        executed = 4
+        for action in plan.actions[:executed].numpy().astype(np.float32):
+            _, _, terminated, truncated, info = env.step(action)
+            if terminated:
+                break
+            assert not truncated
+    assert info["is_success"]
