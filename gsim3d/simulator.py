@@ -37,6 +37,7 @@ from gsim3d.dynamics import (
     rollout,
     rollout_in_parts,
 )
+from gsim3d.effects.actors import Actor, Actors
 from gsim3d.effects.edits import Edit, by_step, structure_of
 from gsim3d.effects.plan import Plan, by_plan, make_plan, unused_parameters
 from gsim3d.effects.selection import any_mask
@@ -241,6 +242,7 @@ class Simulator(nn.Module):
         wrap: Callable[[Callable], Callable] | None = None,
         log: RestLog | None = None,
         edits: Iterable[Edit] = (),
+        actors: Sequence[Actor] = (),
     ) -> list[Particles]:
         """The next ``n_steps`` steps, one :class:`Particles` each with one cloud a scene.
 
@@ -259,15 +261,18 @@ class Simulator(nn.Module):
             wrap: the function that predicts the next steps from a history -> the one to call instead; None: that one.
             log: records which particles rested and were not computed.
             edits: changes of the scene on the way (:mod:`gsim3d.effects.edits`); they wake all particles.
+            actors: particles that move as prescribed (:mod:`gsim3d.effects.actors`).
         Returns:
             Particles of each step.
         Raises:
-            InputError: an edit cannot be made, and the message names its step and operation; or ``plans`` are not as
-                many as scenes.
+            InputError: an edit cannot be made, and the message names its step and operation; ``plans`` are not as many
+                as scenes; or actors cannot move as prescribed.
         Gradients:
-            through all steps.
+            through all steps, also to displacements of actors.
         """
         if plans is not None:
+            if actors:
+                raise InputError("actors: scenes with plans of their own cannot have actors; give one plan")
             options = {"generator": generator, "on_invalid": on_invalid, "report": report, "edits": edits, "log": log}
             parts = [
                 self.rollout(state.select_clouds(clouds), n_steps, one, geometry=geometry, wrap=wrap, **options)
@@ -279,6 +284,9 @@ class Simulator(nn.Module):
         predict = predict if wrap is None else wrap(predict)
         self._check(state, "rollout")
         state, steps = self._prepare(state, plan), []
+        if actors:
+            acting = self._acting(actors, state, plan, n_steps)
+            state, predict = acting.state, acting.wrap(predict)
         structure = plan.spec.structure
         changes = by_step(edits, n_steps, insert=structure.insert, remove=structure.remove)
         for begin, end in pairwise(sorted({0, *changes, n_steps})):
@@ -292,6 +300,13 @@ class Simulator(nn.Module):
                 state = last_steps(concatenate([state, *steps[begin:end][-plan.history :]]), plan.history)
         guard.keywords["report"].send()
         return steps
+
+    def _acting(self, actors: Sequence[Actor], state: Particles, plan: Plan, n_steps: int) -> Actors:
+        if plan.spec.dynamics.sleep is not None:
+            raise InputError("actors: what they touch must not sleep; the plan has dynamics.sleep on")
+        if self.config.dynamics.steps_per_call > 1:
+            raise InputError("actors: this model predicts several steps a call, and actors need one")
+        return Actors(actors, state, n_steps)
 
     def _roll(self, predict, state: Particles, n_steps: int, plan: Plan, generator, log) -> list[Particles]:
         """:meth:`rollout` of a state that is prepared, without edits."""

@@ -179,6 +179,7 @@ ATTRIBUTES = {
         _kept("orientations", (4,), "quaternion", "identity"),
         _kept("color_transform", (3, 3), "matrix", "identity"),
         _kept("frozen_appearance", (), "index", 0.0, validated=False, dtype=torch.bool),
+        _kept("actor", (), "index", -1, validated=False, dtype=torch.int64),
         _kept("initial_latents", default="dynamic_latents", validated=False),
         Attribute("velocity", (3,), "vector", 0.0),
         Attribute("irradiance_gain", (3,), "scalar", 1.0),
@@ -219,6 +220,8 @@ class Particles(TensorRecord):
         color_transform: [N, 3, 3], a matrix that decoded colours of latent models are multiplied by; set by edits.
         frozen_appearance: bool [N], particles whose changing latents and colours stay constant; only where an effects
             spec selects them (``appearance.frozen_appearance``). Resolved once at the start of a rollout.
+        actor: int64 [N], number of the actor that moves a particle, -1: none; only in rollouts with actors
+            (:mod:`gsim3d.effects.actors`).
         initial_latents: [N, Fd], the dynamic latents at the start of the simulation; only in models with
             ``background="relightable"``.
         velocity: [N, 3] metres a step: the last displacement of simulated particles, the mean displacement since the
@@ -251,6 +254,7 @@ class Particles(TensorRecord):
     orientations: Tensor | None = None
     color_transform: Tensor | None = None
     frozen_appearance: Tensor | None = None
+    actor: Tensor | None = None
     initial_latents: Tensor | None = None
     velocity: Tensor | None = None
     irradiance_gain: Tensor | None = None

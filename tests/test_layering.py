@@ -27,7 +27,7 @@ RINGS = {
         priors
         dynamics
         compat.checkpoints io
-        effects.edits
+        effects.edits effects.actors
         presets
         effects.plan
         cuda_graphs

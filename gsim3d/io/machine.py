@@ -22,7 +22,7 @@ def machine(device: torch.device) -> dict[str, str]:
         "python": platform.python_version(),
     }
     if device.type == "cuda":
-        return found | {"device": torch.cuda.get_device_name(device), "cuda": torch.version.cuda}
+        return found | {"device": torch.cuda.get_device_name(device), "cuda": str(torch.version.cuda)}
     return found | {"device": f"CPU, {torch.get_num_threads()} threads", "processor": processor_name()}
 
 
