@@ -298,7 +298,7 @@ class CapturedRollout:
 
     def _remember(self, background: Particles) -> FrozenContext:
         with torch.no_grad(), self._autocast():
-            return self._model.dynamics.remember(background).with_room(self._factor)
+            return self._model.dynamics.remember(background).with_capacity(self._factor)
 
     def _observed(self) -> list[PyramidCapacity]:
         """Capacities that the calls of the dynamics need; from a rollout that waits for every count."""
@@ -306,7 +306,7 @@ class CapturedRollout:
 
         def geometry(history: Particles) -> Pyramid:
             pyramid = self._model.dynamics.geometry(history)
-            needed.append(PyramidCapacity.of(pyramid, self._model.dynamics.room(history), self._factor))
+            needed.append(PyramidCapacity.of(pyramid, self._model.dynamics.capacity(history), self._factor))
             return pyramid
 
         self._rollout(geometry, StabilityReport())

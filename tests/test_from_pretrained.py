@@ -102,7 +102,7 @@ def test_speed_is_read_beside_the_weights(folder):
     ("change", "message"),
     [
         ({"steps": 0}, "steps must be at least 1; got 0"),
-        ({"inputs": dataclasses.replace(INPUTS, image_size=(32, 48))}, "images must be of 32x48 pixels"),
+        ({"inputs": dataclasses.replace(INPUTS, image_size=(32, 48))}, "images must be 32x48 pixels"),
     ],
 )
 def test_predictions_that_are_refused(simulator, change, message):

@@ -376,7 +376,7 @@ def test_plan_names_parameters_without_use():
     shorter = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, history_bits=1))
     assert make_simulator(shorter).plan().unused == ("dynamics.net.encoder.2.merge.time_embedding",)
     assert make_simulator().plan().unused == ()
-    with pytest.raises(UnsupportedEffect, match="history: this model goes up to 2"):
+    with pytest.raises(UnsupportedEffect, match="history: this model supports at most 2"):
         make_simulator(shorter).plan(EffectsSpec(dynamics=DynamicsEffects(history=3)))
 
 

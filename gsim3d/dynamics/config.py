@@ -1,4 +1,4 @@
-"""The shape of the dynamics model."""
+"""Configuration of the dynamics."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ BACKGROUNDS = ("symmetric", "asymmetric", "relightable")
 
 @dataclass(frozen=True, kw_only=True)
 class DynamicsConfig(TransformerConfig):
-    """What the dynamics predicts, from what, and with which priors; beside the settings of its network.
+    """Configuration of the dynamics: its outputs, priors and background, on top of the transformer's.
 
     Attributes:
-        dynamic_latents, static_latents: channels of Particles.dynamic_latents and .static_latents.
-        explicit: particles carry their own Gaussian parameters (quats, scales, sh), and all of them change with time.
-        sh_degree: of explicit particles.
-        scale_min, scale_max: metres, limits of explicit scales.
-        predicts: "from_newest": the network predicts how much each later state differs from the newest one of the
-            history; "from_previous": from the state one step before it; "absolute": the state itself.
+        dynamic_latents: channels of ``Particles.dynamic_latents``.
+        static_latents: channels of ``Particles.static_latents``.
+        explicit: particles carry Gaussian parameters (quats, scales, sh), which the network changes.
+        sh_degree: degree of the spherical harmonics of explicit particles.
+        scale_min: smallest scale of explicit particles in metres.
+        scale_max: largest scale of explicit particles in metres.
+        predicts: "from_newest": the change from the newest state of the history to each later state; "from_previous":
+            the change from the previous state; "absolute": the state itself.
         steps_per_call: steps that one call of the network predicts.
-        max_step: metres; one step moves a particle by this at most along each axis. None: no limit, and none to how
-            much a scale changes.
-        max_latent_step: the same for each dynamic latent. None: no limit.
-        position_features: the network also sees positions relative to the scene's origin (in units of
-            ``position_length`` metres) and inside the cell. Learning where the ground is takes far less data so;
-            without it the network knows particles by their neighbours only, and motion does not depend on positions.
-        position_length: metres, unit of these positions.
-        priors: hand-made physics, in the order in which it applies (:mod:`gsim3d.priors`); none: all is learned.
-        background: "symmetric": frozen particles are like others to the network, and their latents change;
-            "asymmetric": frozen particles of the newest step read each other only, never change, and are computed once
-            a rollout; the others read both (:mod:`gsim3d.dynamics.frozen_context`); "relightable": the network sees
-            frozen particles in the newest step only and as they were when the simulation began; it predicts by how much
-            their latents differ from that now, so that the errors of shadows do not add up, and in the same way those
-            of bodies where a plan lets them change. Weights fit all; train as you simulate.
-        shuffle_orders: in training the four curves of a stage change places at random.
+        max_step: largest displacement in a step along each axis in metres; None: unlimited, as changes of scales.
+        max_latent_step: largest change of each dynamic latent in a step; None: unlimited.
+        position_features: adds positions relative to the scene's origin and inside the cell to the network's input.
+            Without them the motion is translation-invariant, and learning the height of the ground takes more data.
+        position_length: unit of the relative positions in metres.
+        priors: hand-made physics in order of application (:mod:`gsim3d.priors`).
+        background: "symmetric": the network treats frozen particles as all others, and changes their latents;
+            "asymmetric": frozen particles attend only to each other, never change, and are computed once a rollout,
+            and moving particles attend to both (:mod:`gsim3d.dynamics.frozen_context`); "relightable": the network
+            reads frozen particles in the newest step only, with their initial latents, and predicts changes from these,
+            so that errors of shadows do not accumulate; bodies with changing latents are treated the same way. The
+            weights have the same shapes for all three; use the same value for training and simulation.
+        shuffle_orders: shuffles the four curves of each level in training.
     """
 
     dynamic_latents: int = 32
@@ -68,7 +68,7 @@ class DynamicsConfig(TransformerConfig):
         if self.is_asymmetric and self.norm == "batch":
             raise ValueError('DynamicsConfig: background="asymmetric" needs norm="layer"')
         if self.is_relightable and self.explicit:
-            raise ValueError('DynamicsConfig: background="relightable" needs a model that is not explicit')
+            raise ValueError('DynamicsConfig: background="relightable" does not support explicit models')
         if self.steps_per_call < 1:
             raise ValueError(f"DynamicsConfig: steps_per_call must be at least 1; got {self.steps_per_call}")
         check_ranges(self, position_length=(1e-6, 1e6), scale_max=(1e-6, 1e6), scale_min=(0, self.scale_max))
@@ -78,7 +78,7 @@ class DynamicsConfig(TransformerConfig):
             self._check_prior(prior)
 
     def build_priors(self) -> PriorList:
-        """The modules of ``priors``, with their first weights."""
+        """Returns the modules of ``priors`` with initial weights."""
         return PriorList([config.build() for config in self.priors])
 
     def _check_prior(self, prior: Prior) -> None:
@@ -102,10 +102,10 @@ class DynamicsConfig(TransformerConfig):
 
     @property
     def max_opacity(self) -> float:
-        """The largest opacity of a particle."""
+        """Largest opacity of a particle."""
         return 1.0
 
     @property
     def frozen_turn(self) -> bool:
-        """Whether frozen explicit particles change their orientation."""
+        """Whether the orientation of frozen explicit particles changes."""
         return False

@@ -1,16 +1,16 @@
-"""A background that is computed once: frozen rows read each other only, the others read both.
+"""Cached network activations of a static background: frozen particles attend to each other, moving particles to both.
 
-The network runs over the background alone, one cloud a scene in the newest time slot, with cells, clusters, patches and
-curves of its own. Three things are kept of that run, for as long as the background stays:
+The network runs once over the background alone, one cloud a scene in the newest time slot, with its own voxels,
+clusters, patches and curves. While the background does not change, the following is cached:
 
-* of every convolution a field: what the background adds to it in every cell that has background within reach. A moving
-  row looks up its cell: a tap adds the mean of the moving rows of a neighbour cell and the mean of its frozen rows.
-* of every attention the keys and values. A moving row attends to its own patch, as without a background, and to the one
-  background patch in whose interval of the curve it lies, in one softmax.
-* the places of both: sorted keys, found by binary search.
+* For every convolution, a field: the contribution of the background to each cell within the kernel's reach. A moving
+  particle looks up its cell; a tap adds the mean of the moving and the mean of the frozen particles of a cell.
+* For every attention, keys and values. A moving particle attends to its own patch and to the background patch whose
+  interval of the curve contains it, in one softmax.
+* Sorted keys of both, for binary search.
 
-Clusters and merged time slots hold moving rows only. So a step costs what the moving rows cost, nothing has a size that
-depends on where they are, and a scene without background is computed as by the symmetric model.
+Clusters and merged time slots contain moving particles only. So the cost of a step depends on the moving particles
+alone, no size depends on their positions, and a scene without background gives the result of the symmetric model.
 """
 
 from __future__ import annotations
@@ -29,20 +29,21 @@ from gsim3d.ops.curve import CURVES, KernelMap, PatchTable, Pyramid, PyramidSpec
 from gsim3d.ops.streams import MANY_STREAMS, Streams
 from gsim3d.state import Particles
 
-DEPTH = 16  # levels of the curves at stage 0, and bits of a cell along an axis
-SPACE_BITS = 3 * DEPTH  # below the scene in a key
-NOWHERE = torch.iinfo(torch.int64).max  # a key behind all others
+DEPTH = 16  # depth of the curves at level 0, and bits of a cell index along an axis
+SPACE_BITS = 3 * DEPTH  # bits of a key below the scene
+NOWHERE = torch.iinfo(torch.int64).max  # key above all others, for missing cells
 ALL_CURVES = (0, 1, 2, 3)
 
 
 @dataclass(frozen=True)
 class Field:
-    """Where a convolution meets the background: D cells, the last of them nowhere.
+    """The D cells to which the background contributes in a convolution; the last one is NOWHERE.
 
     Attributes:
-        cells: int64 [D], keys, ascending.
-        occupied: int64 [V], the cells of the background's voxels.
-        voxels, kernel_map: from the occupied cells to all.
+        cells: int64 [D], ascending keys.
+        occupied: int64 [V], indices of the cells of the background's voxels.
+        voxels: one voxel for each cell.
+        kernel_map: taps from occupied cells to all cells.
     """
 
     cells: Tensor
@@ -53,14 +54,15 @@ class Field:
 
 @dataclass(frozen=True)
 class Places:
-    """Where the background is found at one stage.
+    """Lookup tables of the background at one level.
 
     Attributes:
-        cells: of the fields, by kernel size.
-        first: int64 [4, P], the key at which each patch begins along each serialization; of the first patch of a scene
-            the scene's lowest.
-        kv_rows, cu_k: int64 [4, M] and [P + 1], the keys of each patch, as in :class:`PatchTable`.
-        patch_size: the most keys of a patch.
+        cells: kernel size -> cells of the field.
+        first: int64 [4, P], first key of each patch along each curve; the first patch of a scene starts at the lowest
+            key of the scene.
+        kv_rows: int64 [4, M], rows of the attention keys, as in :class:`PatchTable`.
+        cu_k: int64 [P + 1], offsets of the patches in ``kv_rows``.
+        patch_size: largest number of keys of a patch.
     """
 
     cells: dict[int, Tensor]
@@ -72,14 +74,15 @@ class Places:
 
 @dataclass(frozen=True)
 class FrozenContext:
-    """What moving rows read of the background, through all calls of a rollout.
+    """Cached activations of the background for all calls of a rollout.
 
     Attributes:
-        curves, depths: of each stage: which curves the run uses, as do calls that read it, and how many levels they
-            have.
-        places: of each stage; none where no row is seen.
-        fields: [D, C] of every convolution, by module.
-        keys, values: [N, H, C / H] of every attention, by module.
+        curves: indices of the curves of each level, also for calls that read the context.
+        depths: depth of the curves of each level.
+        places: lookup tables of each level; empty if the background has no particles.
+        fields: convolution -> contribution to each cell [D, C].
+        keys: attention -> keys [N, H, C / H].
+        values: attention -> values [N, H, C / H].
     """
 
     curves: tuple[tuple[int, ...], ...]
@@ -97,29 +100,38 @@ class FrozenContext:
         spec: PyramidSpec,
         curves: tuple[tuple[int, ...], ...] | None = None,
     ) -> tuple[FrozenContext, list[Recorder]]:
-        """The places of ``particles``, whose geometry is ``pyramid``; and what keeps, at each stage, the rest."""
+        """Starts a context for the background ``particles``.
+
+        Args:
+            pyramid: geometry of the background.
+            particles: background, at most one cloud a scene.
+            spec: strides and patch sizes of the pyramid.
+            curves: indices of the curves of each level; None: all in order.
+        Returns:
+            The context, and for each level the recorder that fills it in a call of the network.
+        """
         curves = (ALL_CURVES,) * len(pyramid.stages) if curves is None else curves
         depths = tuple(DEPTH + 1 - n.bit_length() for n in accumulate((1, *spec.strides), operator.mul))
         if pyramid.rows.shape[0] == 0:
             return cls(curves, depths, ()), []
-        rooms = list(zip(pyramid.stages, row_scenes(pyramid, particles), depths, strict=True))
-        fields = [{size: _field(*room, size) for size in room[0].kernel_maps} for room in rooms]
-        chosen = zip(fields, rooms, curves, spec.patch_sizes, strict=True)
-        places = tuple(_places(at, *room, of_stage, size) for at, room, of_stage, size in chosen)
+        levels = list(zip(pyramid.stages, row_scenes(pyramid, particles), depths, strict=True))
+        fields = [{size: _field(*level, size) for size in level[0].kernel_maps} for level in levels]
+        chosen = zip(fields, levels, curves, spec.patch_sizes, strict=True)
+        places = tuple(_places(at, *level, of_level, size) for at, level, of_level, size in chosen)
         background = cls(curves, depths, places)
         return background, [Recorder(background, at, stage) for at, stage in zip(fields, pyramid.stages)]
 
     def readers(self, pyramid: Pyramid, particles: Particles) -> list[Reader]:
-        """What a call over moving ``particles`` is given, for each stage; nothing waits for the device."""
+        """Readers of each level for a call over moving ``particles``, without a device sync."""
         scenes = row_scenes(pyramid, particles)
-        rooms = list(zip(self.places, pyramid.stages, scenes, self.depths, self.curves))
-        with Streams(particles.means, MANY_STREAMS) as streams:  # many launches over few rows; none waits for another
-            patches = [streams.run(_overlap, *room) for room in rooms]
-            cells = [streams.run(_cells_of_rows, *room[:3]) for room in rooms]
-        return [Reader(self, *of_stage) for of_stage in zip(cells, patches, strict=True)]
+        levels = list(zip(self.places, pyramid.stages, scenes, self.depths, self.curves))
+        with Streams(particles.means, MANY_STREAMS) as streams:  # many independent launches over few rows
+            patches = [streams.run(_overlap, *level) for level in levels]
+            cells = [streams.run(_cells_of_rows, *level[:3]) for level in levels]
+        return [Reader(self, *of_level) for of_level in zip(cells, patches, strict=True)]
 
     def map(self, f: Callable[[Tensor, int], Tensor]) -> FrozenContext:
-        """The same background with ``f`` applied to every tensor and its kind (KEYS, LISTS, OFFSETS or ROWS)."""
+        """Applies ``f`` to every tensor and its kind (KEYS, LISTS, OFFSETS or ROWS)."""
         places = tuple(
             Places(
                 {size: f(cells, KEYS) for size, cells in at.cells.items()},
@@ -133,12 +145,12 @@ class FrozenContext:
         kept = ({module: f(x, ROWS) for module, x in part.items()} for part in (self.fields, self.keys, self.values))
         return FrozenContext(self.curves, self.depths, places, *kept)
 
-    def with_room(self, factor: float) -> FrozenContext:
-        """Another one that reads alike, with room for ``factor`` times as much."""
+    def with_capacity(self, factor: float) -> FrozenContext:
+        """An equivalent context, padded to ``factor`` times its sizes."""
         return self.map(lambda x, kind: _longer(x, kind, math.ceil(factor * _length(x, kind))))
 
     def load(self, other: FrozenContext) -> bool:
-        """Takes the numbers of ``other`` into its own memory; False where there is no room for them."""
+        """Copies ``other`` into the memory of this context. Returns False if its sizes exceed the capacity."""
         own, given = [], []
         self.map(lambda x, kind: own.append((x, kind)) or x)
         other.map(lambda x, kind: given.append(x) or x)
@@ -150,7 +162,7 @@ class FrozenContext:
 
 
 class Recorder:
-    """Keeps what moving rows will read of one stage of the run over the background."""
+    """Records the activations of one level in the call over the background."""
 
     records = True
 
@@ -158,27 +170,27 @@ class Recorder:
         self.background, self.fields, self.stage = background, fields, stage
 
     def convolved(self, conv: nn.Module, x: Tensor, out: Tensor) -> Tensor:
-        """``out``, which ``conv`` made of ``x``."""
+        """Records the field of ``conv`` for its input ``x``. Returns its output ``out``."""
         at, voxels = self.fields[conv.kernel_size], self.stage.voxels
         means = ops.pool_mean(x, voxels.rows, voxels.cu_rows, check=False)
         x = means.new_zeros(at.cells.shape[0], means.shape[1]).index_copy(0, at.occupied, means)
         weight = conv.full_weight()
-        around = torch.ones_like(weight[:1, ..., :1])  # the centre tap reads a row itself
+        around = torch.ones_like(weight[:1, ..., :1])  # the center tap reads the row itself
         around[0, *[conv.kernel_size // 2] * 3] = 0
         field = ops.sparse_conv(x, weight * around, None, at.voxels, at.kernel_map, check=False)
-        # A block that is computed again in the backward pass does the same again, and leaves what was kept.
+        # A checkpointed block is computed again in the backward pass; the first record stays.
         self.background.fields.setdefault(conv, field)
         return out
 
     def attended(self, attention: nn.Module, q: Tensor, k: Tensor, v: Tensor, patches: PatchTable, row: int) -> Tensor:
-        """``attention`` of the background to itself."""
+        """Records keys and values. Returns the attention of the background to itself."""
         self.background.keys.setdefault(attention, k)
         self.background.values.setdefault(attention, v)
         return ops.patch_attention(q, k, v, patches, check=False)
 
 
 class Reader:
-    """Adds to one stage of a call over moving rows what they read of the background."""
+    """Adds the contributions of the background to one level of a call over moving particles."""
 
     records = False
 
@@ -195,26 +207,23 @@ class Reader:
 
 
 def row_scenes(pyramid: Pyramid, particles: Particles) -> list[Tensor]:
-    """int64 [N] for each stage: the scene of every row, anything for rows of a given capacity that are none."""
+    """Scene of every row for each level, int64 [N]; undefined for padding."""
     pooled = [Segments(pyramid.rows, pyramid.cu_rows), *(stage.cluster for stage in pyramid.stages[1:])]
     return ops.row_scenes(particles.cloud_scene, particles.cu_rows, pooled)
 
 
 def _cells_of_rows(places: Places, stage: Stage, scene: Tensor) -> dict[int, Tensor]:
-    """Where the rows of a stage find the fields, by kernel size."""
+    """Kernel size -> index of the field's cell of each row of a level."""
     return {size: ops.find_cells(cells, scene, stage.grid) for size, cells in places.cells.items()}
 
 
 def _overlap(
     places: Places, stage: Stage, scene: Tensor, depth: int, curves: tuple[int, ...]
 ) -> tuple[PatchTable, ...]:
-    """The patches of the background around the rows of a stage, along each curve."""
+    """Background patches of the rows of a level along each curve."""
     codes, at = _codes(stage, scene, depth, curves), (stage.order, stage.cu_clouds)
     background = places.first, places.kv_rows, places.cu_k
     return ops.overlapping_patches(*background, codes, *at, patch_size=places.patch_size)
-
-
-# ---- places ----
 
 
 def _cell_keys(scene: Tensor, grid: Tensor) -> Tensor:
@@ -223,12 +232,12 @@ def _cell_keys(scene: Tensor, grid: Tensor) -> Tensor:
 
 
 def _shifted(keys: Tensor, offsets: Tensor, depth: int) -> tuple[Tensor, Tensor]:
-    """Keys [..., V] of the cells [..., 3] further; whether they lie inside the 2^depth cells along each axis."""
+    """Keys [..., V] of the cells shifted by ``offsets`` [..., 3], and whether they lie inside the 2^depth cells."""
     inside = True
     for axis, shift in enumerate((2 * DEPTH, DEPTH, 0)):
         step = offsets[..., axis, None]
-        place = (keys >> shift & (1 << DEPTH) - 1) + step
-        inside = (place >= 0) & (place < 1 << depth) & inside
+        index = (keys >> shift & (1 << DEPTH) - 1) + step
+        inside = (index >= 0) & (index < 1 << depth) & inside
         keys = keys + (step << shift)
     return keys, inside
 
@@ -247,7 +256,7 @@ def _places(
 
 
 def _codes(stage: Stage, scene: Tensor, depth: int, curves: tuple[int, ...]) -> Tensor:
-    """int64 [4, N]: places along the serializations, scenes above them."""
+    """Codes of the rows along the four curves with the scene in the high bits, int64 [4, N]."""
     return ops.curve_encode(stage.grid, scene, [CURVES[c] for c in curves], depth=depth, shift=SPACE_BITS)
 
 
@@ -263,7 +272,7 @@ def _field(stage: Stage, scene: Tensor, depth: int, kernel_size: int) -> Field:
         cells = torch.unique(spread[inside])
     cells = torch.cat([cells, cells.new_full((1,), NOWHERE)])
     occupied = torch.searchsorted(cells, keys)
-    # Cells above each other follow each other: one search serves a column of taps.
+    # Cells of a column have consecutive keys: one search serves a column of taps.
     columns = torch.nn.functional.pad(torch.cartesian_prod(steps, steps), (0, 1))
     seen_from, inside = _shifted(keys, -columns, depth)
     heights = (keys & (1 << DEPTH) - 1) - steps[:, None]
@@ -277,13 +286,11 @@ def _field(stage: Stage, scene: Tensor, depth: int, kernel_size: int) -> Field:
     return Field(cells, occupied, Voxels(each[:-1], each[:-1], each), KernelMap(kernel_size, tap_in, tap_out, cu_taps))
 
 
-# ---- room ----
-
-KEYS, LISTS, OFFSETS, ROWS = range(4)  # what may be longer, and how it goes on: nowhere, 0, with its last entry, 0
+KEYS, LISTS, OFFSETS, ROWS = range(4)  # kinds of tensors; they are padded with NOWHERE, 0, the last entry, 0
 
 
 def _length(x: Tensor, kind: int) -> int:
-    """Entries along the axis that may be longer, the first one of rows, else the last; offsets have one more."""
+    """Entries along the axis that is padded: the first one of ROWS, else the last. OFFSETS have one more entry."""
     return x.shape[0] if kind == ROWS else x.shape[-1] - (kind == OFFSETS)
 
 

@@ -1,4 +1,4 @@
-"""Particles of the last steps -> particles of the next steps."""
+"""The dynamics: predicts the next steps of particles from their last steps."""
 
 from __future__ import annotations
 
@@ -33,22 +33,21 @@ from gsim3d.state import (
     with_attribute,
 )
 
-SLACK = 1.1  # for particles that a call reads, over what was counted
+SLACK = 1.1  # capacity over the counted number of particles
 
 
 class Dynamics(nn.Module):
-    """Predicts how particles change in one step.
+    """Predicts the next step of particles by a point transformer and priors (:mod:`gsim3d.priors`).
 
-    The network reads all steps of a history together; each particle of the newest step gets an increment, and priors
-    (:mod:`gsim3d.priors`) move particles besides. Steps are counted back from the newest, so one model serves any
-    history of 1 to ``2 ** config.history_bits`` steps. Scenes do not change each other (in training with
-    ``norm="batch"`` they do). Particles that are asleep, outside the 2^16 cells from the scene's origin, or at no
-    finite position, keep their state and are not seen by others.
+    The network processes all steps of a history together and predicts a change of each particle of the newest step.
+    Time slots count back from the newest step, so a model accepts histories of 1 to ``2 ** config.history_bits`` steps.
+    Scenes are independent, except in training with ``norm="batch"``. Particles that are asleep, outside the 2^16 cells
+    from the scene's origin, or not finite keep their state and are invisible to others.
 
     Attributes:
-        priors: of the model, in order.
-        layout: of the network's inputs and outputs.
-        rounds: whether geometry is rounded in training; None: on a GPU.
+        priors: priors in order of application.
+        layout: layout of the network's inputs and outputs.
+        rounds: whether sizes of the geometry are rounded up in training; None: on a GPU only.
     """
 
     def __init__(self, config: DynamicsConfig):
@@ -69,13 +68,14 @@ class Dynamics(nn.Module):
         curves: tuple[tuple[int, ...], ...] | None = None,
         rounded: bool = False,
     ) -> Pyramid:
-        """All that the network reads of the positions, as integers.
+        """Builds the integer geometry of a call from the positions.
 
         Args:
-            history, generator: as :meth:`forward`.
-            capacity: sizes of the result, so that nothing waits for the device; None: what the positions need.
-            curves: of each stage, as of a background that is read; None: drawn from ``generator``.
-            rounded: as of :func:`gsim3d.ops.build_pyramid`.
+            history: as :meth:`forward`.
+            generator: as :meth:`forward`.
+            capacity: sizes of the result, which avoid a device sync; None: exact sizes.
+            curves: indices of the curves of each level; None: drawn from ``generator``.
+            rounded: as in :func:`gsim3d.ops.build_pyramid`.
         """
         clouds = history.clouds
         slots, history_bits = self._slots(clouds, newest_clouds(clouds))
@@ -101,29 +101,31 @@ class Dynamics(nn.Module):
 
     @contextlib.contextmanager
     def moving_at_most(self, n_rows: int) -> Iterator[None]:
-        """Within it no scene has more movable particles than ``n_rows``: a GPU computes features of these alone,
-        as a CPU does that counts them."""
+        """Context in which no scene has more than ``n_rows`` movable particles: a GPU then pads priors to this size
+        without a device sync. A CPU counts them."""
         before, self._most_movable = self._most_movable, n_rows
         try:
             yield
         finally:
             self._most_movable = before
 
-    def room(self, history: Particles) -> int:
-        """The capacity that calls like that of ``history`` need, in particles: with a relightable background of those
-        that the network sees, which waits for the device."""
+    def capacity(self, history: Particles) -> int:
+        """Number of particles for which a pyramid of ``history`` needs capacity.
+
+        With a relightable background it counts the particles that the network sees, which needs a device sync.
+        """
         if not self.config.is_relightable:
             return history.n_rows
         return min(history.n_rows, math.ceil(SLACK * int(self._seen(history).sum())))
 
     def remember(self, background: Particles, *, generator: torch.Generator | None = None) -> FrozenContext:
-        """What moving particles read of a background, for all calls until it changes.
+        """Computes the context of a static background, for all calls until it changes.
 
         Args:
             background: at most one cloud a scene.
             generator: as :meth:`forward`.
         Gradients:
-            as :meth:`forward`.
+            As :meth:`forward`.
         """
         curves = self._draw_curves(generator)
         pyramid = self.geometry(background, curves=curves)
@@ -131,15 +133,18 @@ class Dynamics(nn.Module):
         if recorders:
             base = self.layout.pack(background)
             further = sum(prior.n_conv_features + prior.n_features for prior in self.priors)
-            x = torch.cat([base, base.new_zeros(len(base), further)], 1)  # priors see movable particles only
+            x = torch.cat([base, base.new_zeros(len(base), further)], 1)  # no features of priors
             x = ops.pool_mean(x, pyramid.rows, pyramid.cu_rows, check=False)
             self.net(x, pyramid, generator=self._draws(generator, x.device), contexts=recorders)
         return context
 
     def observe(self, particles: Particles, frames: Frames, n_views: int | None = None) -> Particles:
-        """``particles``, which were encoded from ``frames``, with what priors read off both.
+        """Initializes attributes of priors after encoding.
 
-        n_views: images of every cloud, which follow each other, cloud by cloud; nothing then waits for the device.
+        Args:
+            particles: particles encoded from ``frames``.
+            frames: input images.
+            n_views: number of images of every cloud, if equal and in order of clouds; avoids a device sync.
         """
         for prior in self.priors:
             ctx = self.context(particles)
@@ -148,13 +153,13 @@ class Dynamics(nn.Module):
         return particles
 
     def initialize(self, particles: Particles) -> Particles:
-        """``particles`` with what priors know of them, at the start of a rollout or after an edit."""
+        """Initializes attributes of priors at the start of a rollout or after an edit."""
         for prior in self.priors:
             particles = prior.initialize(particles, self.context(particles))
         return particles
 
     def begin(self, particles: Particles) -> Particles:
-        """``particles`` with the attributes that a step reads; absent ones begin here."""
+        """Adds missing attributes that a step reads."""
         if self.config.is_relightable:
             particles = with_attribute(particles, "initial_latents")
         for prior in self.priors:
@@ -170,28 +175,28 @@ class Dynamics(nn.Module):
         background: FrozenContext | None = None,
         changes: Mapping[str, str] | None = None,
     ) -> Particles:
-        """The next step of every scene, or the next ``config.steps_per_call`` steps.
+        """Predicts the next ``config.steps_per_call`` steps of every scene.
 
         Args:
-            history: clouds sorted by (scene, step); steps may have different numbers of particles, and gaps are fine.
-            generator: of drop path and of the curves' shuffling, both in training only; None: neither happens.
-            pyramid: ``geometry(history)``; None: made here. With one of a given capacity nothing waits for the device,
-                and the result has the same values as long as ``pyramid.found`` fits the capacity.
-            background: static particles, of :meth:`remember`; then ``history`` holds the moving ones of a
-                :class:`Partition`. None: with ``config.background="asymmetric"`` all that is done here.
-            changes: what a step changes, of ``layout.changes``; the rest is not computed. None: all that is predicted.
+            history: clouds sorted by (scene, step). Steps may have different numbers of particles, and may be missing.
+            generator: randomness of drop path and curve shuffling in training; None: neither is applied.
+            pyramid: ``geometry(history)``; None: built here. A pyramid with a capacity avoids device syncs and gives
+                the same values, as long as ``pyramid.found`` fits the capacity.
+            background: context of the static particles, from :meth:`remember`; ``history`` then holds the moving
+                particles of a :class:`Partition`. None: computed here if ``config.background="asymmetric"``.
+            changes: attributes that a step changes, from ``layout.changes``; None: all predicted attributes.
         Returns:
-            One cloud a scene and step, each with the particles of the scene's newest step.
+            One cloud a scene and step, with the particles of the scene's newest step.
         Gradients:
-            features and positions of ``history``, parameters. Cells are constants.
+            To features and positions of ``history`` and to parameters. Cell indices are constants.
         Raises:
-            ValueError: clouds are not sorted, a history is longer than the model's, or a model with ``norm="batch"`` is
-                trained on a pyramid of given capacity: its statistics would count padding.
+            ValueError: clouds are not sorted, a history is too long, or a model with ``norm="batch"`` is trained on a
+                pyramid with a capacity, whose padding would enter its statistics.
         """
         changes = changes or self.layout.changes()
         if background is None and self.config.is_asymmetric:
             return self._forward_in_parts(history, generator, changes)
-        history = self._as_it_began(self.begin(history), changes)
+        history = self._with_initial_latents(self.begin(history), changes)
         if pyramid is None:
             curves = None if background is None else background.curves
             rounded = background is None and self._rounds(history)
@@ -209,17 +214,17 @@ class Dynamics(nn.Module):
         return steps[0] if len(steps) == 1 else concatenate(steps)
 
     def _move(self, ctx: StepContext, network: Tensor, gains: Mapping[str, Tensor]) -> Tensor:
-        """[N, 3] metres, the displacement of a step with priors."""
+        """Displacement [N, 3] in metres of a step with priors."""
         motion = Motion.of_network(network)
         for prior in self.priors:
             motion = prior.move(motion, gains.get(prior.name), ctx)
-        most = math.inf if self.config.max_step is None else self.config.max_step
-        return motion.total().clamp(-most, most)
+        limit = math.inf if self.config.max_step is None else self.config.max_step
+        return motion.total().clamp(-limit, limit)
 
     def _predict(
         self, ctx: StepContext, pyramid: Pyramid, generator: torch.Generator | None, background: FrozenContext | None
     ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """Outputs and gains of the network for the newest particles, as :meth:`StateLayout.split` returns them."""
+        """Outputs and gains of the network for the newest particles, from :meth:`StateLayout.split`."""
         history, n_data = ctx.history, [stage.n_data for stage in pyramid.stages]
         if pyramid.found is not None and self.training and self.config.norm == "batch" and None in n_data:
             raise ValueError(
@@ -228,7 +233,7 @@ class Dynamics(nn.Module):
         x = self._features(ctx)
         n_seen = pyramid.rows.shape[0] if pyramid.found is None else n_data[0]
         all_seen = n_seen == history.n_rows
-        if not all_seen:  # rows of the pyramid <-> rows of the history; those that sleep become 0
+        if not all_seen:  # rows of the pyramid <-> rows of the history; unseen rows become 0
             x = ops.pool_mean(x, pyramid.rows, pyramid.cu_rows, check=False)
         contexts = () if background is None else background.readers(pyramid, history)
         x = self.net(x, pyramid, generator=self._draws(generator, x.device), contexts=contexts)
@@ -237,12 +242,12 @@ class Dynamics(nn.Module):
             x, seen = (
                 ops.unpool(values, pyramid.rows, pyramid.cu_rows, history.n_rows, check=False) for values in (x, one)
             )
-            ctx.awake = ctx.of_newest(seen)[:, 0] > 0
-        prediction = self.net.head(ctx.of_newest(x), self.layout.columns(ctx.changes))
+            ctx.awake = ctx.select_newest(seen)[:, 0] > 0
+        prediction = self.net.head(ctx.select_newest(x), self.layout.columns(ctx.changes))
         return self.layout.split(prediction, ctx.changes)
 
     def _features(self, ctx: StepContext) -> Tensor:
-        """[M, channels] of all particles of the history: own, of priors convolved, of priors read one by one."""
+        """Input channels [M, C] of the history: attributes, conv features of priors, then their other features."""
         columns = [self.layout.pack(ctx.history)]
         for width, features in (("n_conv_features", "conv_features"), ("n_features", "features")):
             for prior in self.priors:
@@ -252,30 +257,30 @@ class Dynamics(nn.Module):
         return torch.cat(columns, 1)
 
     def context(self, particles: Particles, changes: Mapping[str, str] | None = None) -> StepContext:
-        """What the priors share in a step from ``particles``."""
+        """The context of priors for a step from ``particles``."""
         config, most = self.config, self._most_movable
         sizes = config.grid_size, 2**config.history_bits
         return StepContext(particles, self.priors, *sizes, most_movable=most, changes=changes, share=self.layout.share)
 
-    def _as_it_began(self, history: Particles, changes: Mapping[str, str]) -> Particles:
-        """For a relightable background: ``history`` whose frozen particles look as when the simulation began, and where
-        latents of bodies change, all of them."""
+    def _with_initial_latents(self, history: Particles, changes: Mapping[str, str]) -> Particles:
+        """For a relightable background, resets the dynamic latents of frozen particles, and of bodies if their latents
+        change, to their initial values."""
         if not self.config.is_relightable:
             return history
         bodies = changes["dynamic_latents"] in ("all", "dynamic")
-        as_began = ((history.activity == FROZEN) | bodies & (history.activity != ASLEEP))[:, None]
-        latents = torch.where(as_began, history.initial_latents, history.dynamic_latents)
+        reset = ((history.activity == FROZEN) | bodies & (history.activity != ASLEEP))[:, None]
+        latents = torch.where(reset, history.initial_latents, history.dynamic_latents)
         return dataclasses.replace(history, dynamic_latents=latents)
 
     def _draws(self, generator: torch.Generator | None, device: torch.device) -> torch.Generator | None:
-        """In training ``generator``, or one on ``device`` that follows from it: a GPU would wait for host draws."""
+        """The generator in training: ``generator``, or one on ``device`` seeded by it, to avoid device syncs."""
         if not self.training or generator is None or generator.device.type == device.type:
             return generator if self.training else None
         seed = torch.randint(2**62, (), generator=generator, device=generator.device).item()
         return torch.Generator(device).manual_seed(seed)
 
     def _seen(self, history: Particles) -> Tensor:
-        """bool [N], particles that the network sees."""
+        """bool [N], particles in the network's input."""
         seen = history.activity != ASLEEP
         if self.config.is_relightable:
             runs = history.clouds.row_runs(newest_clouds(history.clouds))
@@ -284,8 +289,8 @@ class Dynamics(nn.Module):
         return seen
 
     def _rounds(self, history: Particles) -> bool:
-        """Whether the network sees padding, so that its matrix products have few sizes: cuBLAS chooses an
-        algorithm on the host for every new one, and clouds that move have new ones at each step."""
+        """Whether sizes are rounded up, so that matrix products have few different sizes: cuBLAS selects an algorithm
+        on the host for every new size."""
         if torch.compiler.is_compiling():
             return False
         return self.training and history.means.is_cuda if self.rounds is None else self.rounds
@@ -303,7 +308,7 @@ class Dynamics(nn.Module):
         return steps[0] if n_steps == 1 else concatenate(steps)
 
     def _slots(self, clouds: CloudTable, newest: list[int]) -> tuple[tuple[int, ...], int]:
-        """Time slot of each cloud, and the bits they are counted in: none where no scene has two steps to merge."""
+        """Time slot of each cloud, and the number of bits of a slot (0 if no scene has several steps)."""
         slots, longest, begin, bits = [], 1, 0, self.config.history_bits
         from_newest = self.config.slots_from_newest
         for last in newest:
@@ -328,7 +333,7 @@ class Dynamics(nn.Module):
 
 
 def _later(particles: Particles, n_steps: int) -> Particles:
-    """The same values as of ``n_steps`` steps later."""
+    """Moves the step numbers of ``particles`` ahead by ``n_steps``."""
     table = particles.clouds
     counts = [table.count(q) for q in range(len(table))]
     later = CloudTable.make(counts, table.scenes, (step + n_steps for step in table.steps), particles.cu_rows.device)
@@ -336,8 +341,12 @@ def _later(particles: Particles, n_steps: int) -> Particles:
 
 
 def _seen_first(seen: Tensor, cu_rows: Tensor, n_rows: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """``n_rows`` particles, ``seen`` ones first: int64 [n_rows] which, where clouds begin among them (the last one
-    ends with all), bool [n_rows] whether they are seen, and how many are seen in all. Waits for nothing."""
+    """Selects ``n_rows`` particles, seen ones first, without a device sync.
+
+    Returns:
+        Indices int64 [n_rows], offsets of the clouds among them, the mask bool [n_rows] of seen ones, and the total
+        number of seen particles [].
+    """
     until = F.pad(seen.cumsum(0), (1, 0))
     rows = torch.sort((~seen).to(torch.uint8), stable=True).indices[:n_rows]
     starts = until[cu_rows].clamp(max=n_rows)

@@ -1,4 +1,4 @@
-"""A history in two parts: the particles that a call of the network advances, and those that rest meanwhile."""
+"""Split of a history into moving particles, which the network advances, and a static background."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ from gsim3d.state import ASLEEP, FROZEN, CloudTable, Particles, last_steps, newe
 
 @dataclass(frozen=True)
 class Partition:
-    """What moves and what rests. Scenes in which nothing moves are in neither part.
+    """Moving particles and background of a history. Scenes without moving particles are in neither part.
 
     Attributes:
-        newest: the last cloud of every scene, with all its particles.
-        moving: all clouds, the particles that move.
-        background: the particles of the newest clouds that rest and are seen; None where the network does not tell them
-            apart.
-        rows: int64, the particles of ``newest`` that the newest clouds of ``moving`` hold.
+        newest: newest cloud of every scene, with all its particles.
+        moving: all clouds, reduced to moving particles.
+        background: static, awake particles of the newest clouds; None for symmetric models.
+        rows: int64, indices into ``newest`` of the newest particles in ``moving``.
     """
 
     newest: Particles
@@ -29,14 +28,14 @@ class Partition:
 
     @classmethod
     def of(cls, history: Particles, *, asymmetric: bool, asleep: Tensor | None = None) -> Partition:
-        """Waits for the device, to count particles.
+        """Splits ``history``; needs a device sync, to count particles.
 
         Args:
             history: clouds sorted by (scene, step).
-            asymmetric: frozen particles rest, and what rests is a background; else frozen particles move with the
-                others (their latents do), and only whole scenes may be asleep.
-            asleep: bool, particles of the newest clouds that rest as well. All clouds of a scene then have the same
-                particles.
+            asymmetric: frozen particles are static and form the background. Otherwise they count as moving, since their
+                latents change, and only whole scenes may be asleep.
+            asleep: bool, sleeping particles of the newest clouds, static as well. All clouds of a scene must then have
+                the same particles.
         """
         newest, background = last_steps(history, 1), None
         if not asymmetric and asleep is None:
@@ -57,13 +56,13 @@ class Partition:
         return self.moving.n_clouds == 0
 
     def whole(self, step: Particles | None, ahead: int) -> Particles:
-        """All particles of every scene ``ahead`` steps after the newest; ``step``: moving ones, None for none."""
+        """All particles ``ahead`` steps after the newest, with the moving ones from ``step`` (None: nothing moved)."""
         table = self.newest.clouds
         counts = [table.count(q) for q in range(len(table))]
         later = CloudTable.make(counts, table.scenes, (s + ahead for s in table.steps), self.newest.cu_rows.device)
         if step is None:
             return self.newest.with_clouds(later)
-        if self.rows.shape[0] == self.newest.n_rows:  # all move
+        if self.rows.shape[0] == self.newest.n_rows:
             return step.with_clouds(later)
         fields = self.newest.row_fields()
         del fields["static_latents"]
@@ -72,7 +71,7 @@ class Partition:
 
 
 def _awake(moving: Particles) -> Particles:
-    """The clouds of scenes whose newest one has particles."""
+    """Clouds of the scenes whose newest cloud has particles."""
     table = moving.clouds
     awake = {table.scenes[q] for q in newest_clouds(table) if table.count(q) > 0}
     kept = [q for q, scene in enumerate(table.scenes) if scene in awake]
@@ -80,7 +79,7 @@ def _awake(moving: Particles) -> Particles:
 
 
 def _in_every_cloud(history: Particles, newest: Particles, asleep: Tensor) -> Tensor:
-    """bool [N] of ``history``: each cloud marked as the newest one of its scene is."""
+    """bool [M] for ``history``: repeats the marks of the newest cloud of a scene for all its clouds."""
     table, starts = history.clouds, dict(zip(newest.clouds.scenes, zip(newest.clouds.starts, newest.clouds.starts[1:])))
     marks = [asleep[slice(*starts[scene])] for scene in table.scenes]
     return torch.cat(marks) if marks else asleep

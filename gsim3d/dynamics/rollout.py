@@ -1,4 +1,4 @@
-"""From one call to many: the steps that come out, each fed back."""
+"""Autoregressive rollouts."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from gsim3d.state import Particles, append_step, concatenate, last_steps, single
 def rollout(
     predict: Callable[[Particles], Particles], history: Particles, n_steps: int, max_steps: int
 ) -> list[Particles]:
-    """The next ``n_steps`` steps, each fed back; gradients flow through all of them.
+    """Predicts ``n_steps`` steps autoregressively. Gradients flow through all of them.
 
     Args:
-        predict: last steps of every scene -> the next step, or several, as :class:`Dynamics`.
-        history: where to start from.
-        n_steps: how many steps to predict.
-        max_steps: how many steps of each scene ``predict`` is given at most.
+        predict: last steps of every scene -> the next step or steps, as :class:`Dynamics`.
+        history: initial steps.
+        n_steps: steps to predict.
+        max_steps: largest number of steps of a scene in the input of ``predict``.
     Returns:
-        One Particles a step, one cloud a scene each; particles are those of the newest step of ``history`` throughout.
+        One Particles a step with one cloud a scene, with the particles of the newest step of ``history``.
     """
     history, steps = last_steps(history, max_steps), []
     while len(steps) < n_steps:
@@ -41,21 +41,26 @@ def rollout_in_parts(
     sleepers: Sleepers | None = None,
     log: RestLog | None = None,
 ) -> list[Particles]:
-    """As :func:`rollout`, of which ``predict`` sees what moves only.
+    """:func:`rollout` in which ``predict`` advances the moving particles only.
 
     Args:
-        predict: last steps of what moves, and its background -> the next steps of what moves.
-        remember: what rests -> the background that ``predict`` reads, made anew whenever others rest; None: the model
-            does not tell them apart, and only whole scenes rest.
-        sleepers: particles that sleep besides frozen ones; None: none.
-        log: gets the numbers of computed particles.
+        predict: last steps of the moving particles, and the background -> their next step or steps.
+        history: initial steps.
+        n_steps: steps to predict.
+        max_steps: largest number of steps of a scene in the input of ``predict``.
+        remember: static particles -> background, computed whenever the set of static particles changes; None: the model
+            is not asymmetric, and only whole scenes may sleep.
+        sleepers: decides which particles fall asleep; None: no sleep.
+        log: counts computed particles.
+    Returns:
+        As :func:`rollout`.
     """
     history, steps, parts = last_steps(history, max_steps), [], None
     log = RestLog() if log is None else log
     while len(steps) < n_steps:
         if parts is None:
             asleep, begin = None, len(steps)
-            if steps:  # all that the model sees was simulated when a particle first falls asleep
+            if steps:  # the whole history is simulated by the first time a particle sleeps
                 history, asleep = last_steps(concatenate(steps[-max_steps:]), max_steps), sleepers.asleep
             parts = Partition.of(history, asymmetric=remember is not None, asleep=asleep)
             moving, background = parts.moving, None
@@ -63,7 +68,7 @@ def rollout_in_parts(
                 background = remember(parts.background)
                 log.remembered += 1
             log.n_rows = parts.newest.n_rows
-        predicted, others_sleep = [None], False
+        predicted, sleep_changed = [None], False
         if not parts.nothing_moves:
             predicted = predict(moving, background)
             moving = append_step(moving, predicted, max_steps)
@@ -74,6 +79,6 @@ def rollout_in_parts(
             steps.append(parts.whole(step, len(steps) + 1 - begin))
             log.moving.append(parts.rows.shape[0])
             if sleepers is not None and len(steps) < n_steps:
-                others_sleep |= sleepers.look(before, steps[-1])
-        parts = None if others_sleep else parts
+                sleep_changed |= sleepers.update(before, steps[-1])
+        parts = None if sleep_changed else parts
     return steps[:n_steps]

@@ -1,16 +1,16 @@
-"""Particles that came to rest are not computed until something near them moves.
+"""Sleep: particles at rest are not computed until something near them moves.
 
-A particle is quiet after ``patience`` steps in which it changed by no more than ``eps``. By the policy "exact" a scene
-sleeps once all its particles are quiet: scenes do not see each other. By "approx" space is cut into cubes with edges of
-``halo`` metres. A cube sleeps while no restless particle is in it or in one of its 26 neighbours, or will be in the
-next step if it moves on as in the last; else it wakes at once. A particle that moves by less than ``halo`` a step, or
-steadily, meets no sleeping particle. Which particles fall asleep is decided every ``patience`` steps only, since other
-sleepers make another background. Sleeping particles are a background to the others, so "approx" needs a model of
+A particle is quiet if it changed by at most ``eps`` a step for ``patience`` steps. With the policy "exact", a scene
+sleeps once all its particles are quiet. With "approx", space is divided into cubes with edges of ``halo`` metres. A
+cube sleeps while neither it nor any of its 26 neighbours contains a restless particle, now or in the next step at
+constant velocity; otherwise it wakes immediately. So a particle that moves by less than ``halo`` a step, or at constant
+velocity, never meets a sleeping particle. Particles fall asleep only at multiples of ``patience`` steps, since every
+change of the sleeping set recomputes the background. Sleeping particles are part of the background, so "approx" needs
 ``background="asymmetric"``.
 
-A particle that sleeps misses changes of up to ``eps`` a step. Where a simulation without sleep would change none of a
-sleeping scene by more, the two differ by at most ``eps`` times the steps slept; with ``eps=0`` by nothing, for then the
-network was shown the same state in all steps of its history and changed nothing.
+The error is at most ``eps`` times the steps slept, as long as a simulation without sleep would change no particle of a
+sleeping scene by more than ``eps`` a step. With ``eps=0`` it is 0: the network received the same state in all steps of
+its history and changed nothing.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from torch import Tensor
 from gsim3d.effects.spec import Sleep
 from gsim3d.state import ASLEEP, ATTRIBUTES, FROZEN, Particles, constant
 
-CUBE_BITS = 16  # of a cube along an axis; cubes further out share the outermost
-WEIGHTS = (1 << 3 * CUBE_BITS, 1 << 2 * CUBE_BITS, 1 << CUBE_BITS, 1)  # of scene, x, y, z in the number of a cube
+CUBE_BITS = 16  # bits of a cube index along an axis; indices are clamped to them
+WEIGHTS = (1 << 3 * CUBE_BITS, 1 << 2 * CUBE_BITS, 1 << CUBE_BITS, 1)  # of scene, x, y, z in the key of a cube
 
 
 @dataclass
 class RestLog:
-    """What a rollout did not compute.
+    """Counts of computed particles in a rollout.
 
     Attributes:
-        n_rows: of the newest clouds, all scenes.
-        moving: for each step, particles that were computed.
-        remembered: how often a background was computed.
-        calls: of the network, over what moves.
+        n_rows: particles of the newest clouds of all scenes.
+        moving: computed particles of each step.
+        remembered: number of computed backgrounds.
+        calls: calls of the network for moving particles.
     """
 
     n_rows: int = 0
@@ -46,20 +46,23 @@ class RestLog:
 
     @property
     def resting_share(self) -> float:
-        """Of all particles and steps."""
+        """Fraction of particles, over all steps, that were not computed."""
         total = self.n_rows * len(self.moving)
         return 1 - sum(self.moving) / total if total else 0.0
 
 
 class Sleepers:
-    """Who sleeps, from one step to the next.
+    """Decides in each step which particles sleep.
 
     Args:
-        rule: when particles sleep.
-        newest: one cloud a scene, the particles that may sleep; all are awake.
-        grid_size: metres, edge of a cell.
-        history: steps that the model sees: what falls asleep has been the same in all of them.
-        changing: fields that a step may change; None: all but those that no model predicts.
+        rule: policy and thresholds.
+        newest: initial particles, one cloud a scene, all awake.
+        grid_size: edge of a cell in metres.
+        history: steps in the model's input. Particles fall asleep only if they were quiet in all of them.
+        changing: attributes that a step may change; None: all predicted attributes.
+
+    Attributes:
+        asleep: bool [N], sleeping particles.
     """
 
     def __init__(
@@ -71,60 +74,58 @@ class Sleepers:
             {name for name in newest.row_fields() if ATTRIBUTES[name].predicted} if changing is None else set(changing)
         )
         self.asleep = torch.zeros(newest.n_rows, dtype=torch.bool, device=newest.means.device)
-        self.anybody = False  # sleeps
-        self.moved_last = torch.zeros_like(self.asleep, dtype=torch.int64)
+        self.any_asleep = False
+        self.last_change = torch.zeros_like(self.asleep, dtype=torch.int64)  # step of the last change
         self.n_steps = 0
 
     @torch.no_grad()
-    def look(self, before: Particles, after: Particles) -> bool:
-        """Whether other particles sleep in the next step than before, by what this step changed.
+    def update(self, before: Particles, after: Particles) -> bool:
+        """Updates ``asleep`` by the changes of a step. Returns whether it changed.
 
-        Waits for the device only where a particle sleeps or may fall asleep now.
+        Needs a device sync only while particles sleep or may fall asleep.
         """
         self.n_steps += 1
-        moved = (
-            after.activity != before.activity
-        ) > self.rule.eps  # what vanishes from the sight of others changed by 1
+        moved = (after.activity != before.activity) > self.rule.eps  # a change of activity counts as 1
         for name in sorted(self.changing):
             allowed = self.reach if name == "means" else self.rule.eps
             moved |= _largest(getattr(after, name) - getattr(before, name)) > allowed
-        self.moved_last.masked_fill_(moved, self.n_steps)
+        self.last_change.masked_fill_(moved, self.n_steps)
         may_fall_asleep = self.n_steps % self.patience == 0
-        if not (may_fall_asleep or self.anybody):
+        if not (may_fall_asleep or self.any_asleep):
             return False
         may_sleep = self._may_sleep(before, after)
         asleep = may_sleep if may_fall_asleep else may_sleep & self.asleep
         if torch.equal(asleep, self.asleep):
             return False
-        self.asleep, self.anybody = asleep, bool(asleep.any())
+        self.asleep, self.any_asleep = asleep, bool(asleep.any())
         return True
 
     def _may_sleep(self, before: Particles, after: Particles) -> Tensor:
-        restless = self.moved_last > self.n_steps - self.patience
+        restless = self.last_change > self.n_steps - self.patience
         scene = after.cloud_scene[after.row_cloud()]
         if self.rule.policy == "exact":
             n_restless = torch.zeros(after.origin.shape[0], dtype=torch.int64, device=scene.device)
             return n_restless.index_add_(0, scene, restless.long())[scene] == 0
         both = after.means, 2 * after.means - before.means
-        here, ahead = (_cubes(places, after.origin, scene, self.rule.halo) for places in both)
+        here, ahead = (_cubes(positions, after.origin, scene, self.rule.halo) for positions in both)
         stirs = restless & (after.activity != ASLEEP)
         return ~_near(here, torch.cat([here[stirs], ahead[stirs]])) & ~restless & (after.activity != FROZEN)
 
 
 def _largest(change: Tensor) -> Tensor:
-    """[N] of [N, ...], the largest size in each particle."""
+    """Largest magnitude of each particle: [N, ...] -> [N]."""
     return change.abs().flatten(1).amax(1) if change.dim() > 1 else change.abs()
 
 
-def _cubes(places: Tensor, origin: Tensor, scene: Tensor, edge: float) -> Tensor:
-    """int64 [N], the scene and cube of every particle as one number."""
-    cubes = torch.floor((places.double() - origin[scene]) / edge).nan_to_num()
-    cubes = cubes.clamp(1, 2**CUBE_BITS - 2).long()  # a cube further out would have neighbours elsewhere
+def _cubes(positions: Tensor, origin: Tensor, scene: Tensor, edge: float) -> Tensor:
+    """Key of the scene and cube of every particle, int64 [N]."""
+    cubes = torch.floor((positions.double() - origin[scene]) / edge).nan_to_num()
+    cubes = cubes.clamp(1, 2**CUBE_BITS - 2).long()  # so that neighbours have valid keys
     return (torch.cat([scene[:, None], cubes], 1) * constant(WEIGHTS, scene.device)).sum(1)
 
 
-def _near(cubes: Tensor, stirred: Tensor) -> Tensor:
-    """bool [N]: particles whose cube is one of ``stirred`` or a neighbour of it."""
+def _near(cubes: Tensor, restless: Tensor) -> Tensor:
+    """bool [N]: whether a cube is one of ``restless`` or a neighbour of one."""
     steps = torch.arange(-1, 2, device=cubes.device)
     offsets = torch.cartesian_prod(steps, steps, steps) @ constant(WEIGHTS, cubes.device)[1:]
-    return torch.isin(cubes, torch.unique(stirred)[:, None] + offsets)
+    return torch.isin(cubes, torch.unique(restless)[:, None] + offsets)

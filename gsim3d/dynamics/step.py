@@ -1,4 +1,4 @@
-"""What the network reads of a particle, what it predicts, and how a prediction becomes the next state."""
+"""Layout of the network's input and output channels, and the update of particles by its outputs."""
 
 from __future__ import annotations
 
@@ -14,25 +14,27 @@ from gsim3d.math.rotations import rotate_left, unit_quats
 from gsim3d.math.spherical_harmonics import degree_damping
 from gsim3d.nn.layers import widened
 from gsim3d.priors import Prior
-from gsim3d.priors.base import bounded
+from gsim3d.priors.base import bounded, hold
+from gsim3d.priors.position_waves import relative_positions
 from gsim3d.state import FROZEN, Particles
 
-SCALE_STEP_SHARE = 1 / 6  # of the range of scales, the most that one step changes a scale
+SCALE_STEP_SHARE = 1 / 6  # largest change of a scale in a step, over the range of scales
 POSITION_CHANNELS = 6
-APPEARANCE = ("dynamic_latents", "sh", "irradiance_gain")  # attributes that frozen_appearance keeps
+APPEARANCE = ("dynamic_latents", "sh", "irradiance_gain")  # constant for particles in frozen_appearance
 
 
 @dataclass(frozen=True)
 class StateLayout:
-    """Order and width of the network's channels: attributes that change, then those that do not, by the alphabet.
+    """Order and width of the network's input and output channels.
 
-    Harmonics are flat as (3, K), quaternions as (x, y, z, w); a difference of rotations is predicted as a rotation
-    vector about world axes. Outputs repeat for every step of a call; behind them come the gains of priors.
+    SH coefficients are flattened as (3, K), quaternions as (x, y, z, w). Changes of rotations are predicted as rotation
+    vectors in world axes. Outputs repeat for each step of a call; the gains of priors follow them.
 
     Attributes:
-        config: of the model.
-        inputs, outputs: (attribute, channels).
-        gains: (prior, channels, attribute that they change).
+        config: configuration of the model.
+        inputs: (attribute, channels) pairs.
+        outputs: (attribute, channels) pairs of one step.
+        gains: (prior, channels, attribute that the gains change).
     """
 
     config: DynamicsConfig
@@ -42,6 +44,7 @@ class StateLayout:
 
     @classmethod
     def of(cls, config: DynamicsConfig, priors: Iterable[Prior] = ()) -> StateLayout:
+        """The layout of a model with these priors."""
         dynamic, static, priors = config.dynamic_latents, config.static_latents, list(priors)
         means = 0 if any(prior.replaces_displacement for prior in priors) else 3
         if not config.explicit:
@@ -64,33 +67,33 @@ class StateLayout:
 
     @property
     def out_channels(self) -> int:
-        """Without gains."""
+        """Output channels of all steps of a call, without gains."""
         return self.config.steps_per_call * sum(n for _, n in self.outputs)
 
     def changes(self, features: str = "all", opacities: bool = True) -> dict[str, str]:
-        """For each predicted attribute, of which particles a step changes it: "all", "dynamic", "frozen" or "none".
+        """Predicted attribute -> particles that a step changes: "all", "dynamic", "frozen" or "none".
 
         Args:
-            features: whose latents and colours change. Those of frozen particles may: a shadow may fall on them.
-            opacities: whether they change, where they are predicted.
+            features: particles whose latents and colours change; frozen ones may change, for example by a shadow.
+            opacities: whether predicted opacities change.
         """
         names = [name for name, _ in self.outputs] + ["means"] + [changed for *_, changed in self.gains]
-        who = {name: features if name in APPEARANCE else "dynamic" for name in names}
-        if "opacities" in who and not opacities:
-            who["opacities"] = "none"
-        if "quats" in who and self.config.frozen_turn:
-            who["quats"] = "all"
-        return who
+        changes = {name: features if name in APPEARANCE else "dynamic" for name in names}
+        if "opacities" in changes and not opacities:
+            changes["opacities"] = "none"
+        if "quats" in changes and self.config.frozen_turn:
+            changes["quats"] = "all"
+        return changes
 
     def _columns(self, changes: Mapping[str, str]) -> list[tuple[str, int, bool]]:
-        """(output or prior, channels, whether it is computed) in the order of the network's outputs."""
+        """(attribute or prior, channels, whether it is computed) in the order of the output channels."""
         outputs = [(name, n, changes[name] != "none") for name, n in self.outputs]
         return outputs * self.config.steps_per_call + [
             (prior, n, changes[changed] != "none") for prior, n, changed in self.gains
         ]
 
     def columns(self, changes: Mapping[str, str]) -> list[tuple[int, int]] | None:
-        """Runs of output channels that ``changes`` asks for; None: all of them."""
+        """Ranges of output channels that ``changes`` needs; None: all channels."""
         runs, begin = [], 0
         for _, n, computed in self._columns(changes):
             if computed:
@@ -99,7 +102,7 @@ class StateLayout:
         return None if runs == [(0, begin)] else runs
 
     def split(self, prediction: Tensor, changes: Mapping[str, str]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """The outputs [S, N, channels] for S steps, and the gains of priors [N, channels], those that are computed."""
+        """Splits a prediction into outputs [S, N, channels] for S steps, and gains [N, channels] by prior."""
         computed = [(name, n) for name, n, computed in self._columns(changes) if computed]
         parts = widened(prediction).split([n for _, n in computed], 1)
         priors, outputs, gains = {name for name, *_ in self.gains}, {}, {}
@@ -111,20 +114,20 @@ class StateLayout:
         return {name: torch.stack(steps) for name, steps in outputs.items()}, gains
 
     def pack(self, particles: Particles) -> Tensor:
-        """[N, in_channels] of all particles."""
+        """Network input [N, in_channels] of all particles."""
         config, columns = self.config, []
         for name, n in self.inputs:
             value = getattr(particles, name)
             if value is None or value[:1].numel() != n * min(1, particles.n_rows):
                 got = "None" if value is None else list(value.shape)
-                raise ValueError(f"Dynamics: particles.{name} must have {n} channels a row; got {got}")
+                raise ValueError(f"Dynamics: particles.{name} must have {n} channels; got {got}")
             columns.append(_flat(name, value))
         if config.position_features:
             columns.append(position_features(particles, config.grid_size, config.position_length))
         return torch.cat(columns, 1)
 
     def displacements(self, particles: Particles, outputs: Mapping[str, Tensor]) -> Tensor:
-        """[S, N, 3] metres, from the newest positions to those after 1, 2, ... steps, as predicted without gains."""
+        """Predicted displacements [S, N, 3] in metres from the newest positions, for each step of a call."""
         if "means" not in outputs:
             return torch.zeros_like(particles.means)[None]
         return self._differences("means", particles.means, outputs["means"])
@@ -137,18 +140,18 @@ class StateLayout:
         awake: Tensor | None = None,
         changes: Mapping[str, str] | None = None,
     ) -> list[Particles]:
-        """The particles after 1, 2, ... ``steps_per_call`` steps.
+        """Particles after each of the ``steps_per_call`` steps.
 
         Args:
-            particles: N, the newest state; those of ``frozen_appearance`` keep their latents and colours.
-            outputs: as :meth:`split` returns them.
-            displacements: [S, N, 3] metres.
-            awake: bool [N], particles that change at all; None: all.
-            changes: of :meth:`changes`; None: all that is predicted.
+            particles: newest state [N]; particles in ``frozen_appearance`` keep latents and colours.
+            outputs: outputs of :meth:`split`.
+            displacements: [S, N, 3] in metres.
+            awake: bool [N], particles that may change; None: all.
+            changes: of :meth:`changes`; None: all predicted attributes change.
         """
         changes = changes or self.changes()
         share = self.share(particles, "means", changes["means"], awake)
-        later = {"means": _hold(share, particles.means, particles.means + share * displacements)}
+        later = {"means": hold(share, particles.means, particles.means + share * displacements)}
         for name in (name for name in outputs if name != "means"):
             share = self.share(particles, name, changes[name], awake)
             later[name] = self.later_values(name, getattr(particles, name), outputs[name], share)
@@ -158,33 +161,39 @@ class StateLayout:
         ]
 
     @staticmethod
-    def share(particles: Particles, name: str, who: str, awake: Tensor | None) -> Tensor:
-        """[N, 1], 1 for particles whose attribute ``name`` changes where it does for ``who``, 0 for others."""
-        frozen = particles.activity == FROZEN
-        rows = {"all": torch.ones_like(frozen), "dynamic": ~frozen, "frozen": frozen}.get(who, torch.zeros_like(frozen))
-        if awake is not None:
-            rows = rows & awake
-        if name in APPEARANCE and particles.frozen_appearance is not None:
-            rows = rows.masked_fill(particles.frozen_appearance, False)
-        return rows[:, None].to(particles.means)
-
-    def later_values(self, name: str, newest: Tensor, predicted: Tensor, share: Tensor) -> Tensor:
-        """[S, N, ...], one attribute after each step of a call.
+    def share(particles: Particles, name: str, which: str, awake: Tensor | None) -> Tensor:
+        """Mask [N, 1] in the dtype of positions: 1 for particles whose attribute ``name`` changes.
 
         Args:
-            name: of the attribute.
-            newest: [N, ...], its newest values.
-            predicted: [S, N, channels].
-            share: [N, 1], how much of a predicted change happens: 0 holds the value, bit by bit.
+            particles: state [N].
+            name: attribute.
+            which: "all", "dynamic", "frozen" or "none".
+            awake: bool [N], particles that may change; None: all.
+        """
+        frozen = particles.activity == FROZEN
+        masks = {"all": torch.ones_like(frozen), "dynamic": ~frozen, "frozen": frozen, "none": torch.zeros_like(frozen)}
+        mask = masks[which] if awake is None else masks[which] & awake
+        if name in APPEARANCE and particles.frozen_appearance is not None:
+            mask = mask.masked_fill(particles.frozen_appearance, False)
+        return mask[:, None].to(particles.means)
+
+    def later_values(self, name: str, newest: Tensor, predicted: Tensor, share: Tensor) -> Tensor:
+        """Values [S, N, ...] of an attribute after each step of a call.
+
+        Args:
+            name: attribute.
+            newest: newest values [N, ...].
+            predicted: network outputs [S, N, channels].
+            share: factor [N, 1] of the predicted change; 0 keeps the value with equal bits.
         """
         if name == "quats":
             return self._later_quats(newest, predicted, share)
         share = share.reshape(*share.shape[:-1], *(1,) * (newest.dim() - 1))
         changed = newest + share * self._differences(name, newest, predicted)
-        return _hold(share, newest, self._in_range(name, changed))
+        return hold(share, newest, self._in_range(name, changed))
 
     def _differences(self, name: str, newest: Tensor, predicted: Tensor) -> Tensor:
-        """[S, N, ...], by how much an attribute differs from its newest values after each step."""
+        """Change [S, N, ...] of an attribute from its newest values, for each step."""
         predicted = _unflat(name, predicted)
         changes = self._target(name, predicted) - newest if self._absolute else self._change(name, predicted)
         return changes.cumsum(0) if self.config.predicts == "from_previous" else changes
@@ -222,19 +231,19 @@ class StateLayout:
         return value
 
     def _later_quats(self, newest: Tensor, predicted: Tensor, share: Tensor) -> Tensor:
-        """As :meth:`later_values`, of rotations: unit quaternions, except where nothing changes."""
+        """:meth:`later_values` of quaternions, which are normalised where they change."""
         if self._absolute:
             target = predicted.roll(1, 2)
-            return _hold(share, newest, unit_quats(newest + share * (target - newest)))
+            return hold(share, newest, unit_quats(newest + share * (target - newest)))
         later, before = [], newest
         for vectors in (share * predicted).unbind(0):
             later.append(rotate_left(before, vectors))
             before = later[-1] if self.config.predicts == "from_previous" else newest
-        return _hold(share, newest, torch.stack(later))
+        return hold(share, newest, torch.stack(later))
 
 
 def _flat(name: str, value: Tensor) -> Tensor:
-    """A field of Particles as [N, channels], in the order that published weights expect."""
+    """An attribute as [N, channels], in the order of the published weights."""
     if name == "sh":
         return value.mT.flatten(1)
     if name == "quats":
@@ -243,26 +252,16 @@ def _flat(name: str, value: Tensor) -> Tensor:
 
 
 def _unflat(name: str, value: Tensor) -> Tensor:
-    """[S, N, channels] -> [S, N, ...] as in Particles."""
+    """[S, N, channels] -> [S, N, ...], inverse of :func:`_flat`."""
     if name == "sh":
         return value.unflatten(2, (3, -1)).mT
     return value[:, :, 0] if name == "opacities" else value
 
 
 def position_features(particles: Particles, grid_size: float, length: float) -> Tensor:
-    """[N, 6]: position relative to the scene's origin in units of ``length``; position inside the cell, -1 to 1."""
-    relative = _from_origin(particles)
+    """Position relative to the origin over ``length``, and position inside the cell in [-1, 1]: [N, 6]."""
+    relative = relative_positions(particles)
     with torch.no_grad():
         corner = torch.floor(relative / grid_size) * grid_size
     inside = (relative - corner) * (2 / grid_size) - 1
     return torch.cat([relative / length, inside], 1).to(particles.means.dtype)
-
-
-def _from_origin(particles: Particles) -> Tensor:
-    """float64 [N, 3]."""
-    return particles.means.double() - particles.origin[particles.cloud_scene[particles.row_cloud()]]
-
-
-def _hold(share: Tensor, newest: Tensor, later: Tensor) -> Tensor:
-    """``newest`` where the share is 0: the same bits, and no gradient into the prediction."""
-    return torch.where(share > 0, later, newest)

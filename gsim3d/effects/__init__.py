@@ -1,1 +1,1 @@
-"""What a scene calls for: effects, the plan that executes them, selections and edits."""
+"""Effects: specs of what to simulate, the plans that execute them, selections and edits."""

@@ -1,11 +1,11 @@
-"""Changes of a scene between steps of a rollout: typed operations on particles.
+"""Edits of a scene between steps of a rollout: typed operations on particles.
 
     edits = [Edit(0, Remove("frozen")), Edit(8, Throw((0.0, 0.0, 0.05), of="moving"))]
     plan = simulator.plan(EffectsSpec(structure=StructureEffects(remove=True)))
     steps = simulator.rollout(state, 24, plan, edits=edits)
 
-An operation changes the whole history that the model sees, so that a moved body keeps its velocity. A selection is
-evaluated in each step of the history, so a box must contain its body in all of them.
+An operation changes all steps of the history, so that a moved body keeps its velocity. Selections are evaluated in each
+step of the history, so a box must contain the body in all of them.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ from gsim3d.state import ATTRIBUTES, FROZEN, CloudTable, Particles, newest_cloud
 Colors = Callable[[Particles], Tensor]  # particles -> [N, 3] colours
 
 GREY = (0.2126, 0.7152, 0.0722)  # luminance of red, green and blue
-DARKEST = 0.05  # luminance; darker particles are brightened as if they had this one
+DARKEST = 0.05  # smallest mean luminance that a recolouring divides by
 
 
 @dataclass(frozen=True)
 class Operation:
-    """A change of the particles of a state.
+    """Base class of operations on particles.
 
     Attributes:
-        of: which particles, a Selection or its ``which``.
+        of: selected particles, a Selection or its ``which``.
     """
 
     of: Selection | str = Selection()
@@ -57,17 +57,17 @@ class Operation:
 
     @abstractmethod
     def apply(self, state: Particles, colors: Colors) -> Particles:
-        """The changed ``state``.
+        """Returns the changed state.
 
         Args:
-            state: the history that the model sees.
-            colors: colours of particles, as they are rendered.
+            state: history of the rollout.
+            colors: particles -> their rendered colours [N, 3].
         """
 
 
 @dataclass(frozen=True)
 class Remove(Operation):
-    """Removes particles: ``Remove("frozen")`` takes the ground away."""
+    """Removes particles: ``Remove("frozen")`` removes the static background."""
 
     name: ClassVar[str] = "remove"
     removes: ClassVar[bool] = True
@@ -78,10 +78,10 @@ class Remove(Operation):
 
 @dataclass(frozen=True)
 class Move(Operation):
-    """Moves particles: ``Move("frozen", (0, 0, 0.1))`` raises the ground.
+    """Translates particles: ``Move("frozen", (0, 0, 0.1))`` raises the ground.
 
     Attributes:
-        by: metres.
+        by: displacement in metres.
     """
 
     by: Vector = (0.0, 0.0, 0.0)
@@ -96,9 +96,9 @@ class Rotate(Operation):
     """Rotates particles and their velocities.
 
     Attributes:
-        axis: direction of the axis in the world.
-        degrees: angle, counter-clockwise.
-        about: metres, a position in the world on the axis; None: the mean of the selected particles of each scene.
+        axis: direction of the axis in world coordinates.
+        degrees: counter-clockwise angle.
+        about: point on the axis in world coordinates (m); None: the mean of the selected particles of each scene.
     """
 
     axis: Vector = (0.0, 0.0, 1.0)
@@ -109,14 +109,14 @@ class Rotate(Operation):
     def __post_init__(self):
         super().__post_init__()
         if not math.hypot(*self.axis) > 0:
-            raise InputError(f"axis must have a direction; got {list(self.axis)}")
+            raise InputError(f"axis must be a nonzero vector; got {list(self.axis)}")
 
     def apply(self, state: Particles, colors: Colors) -> Particles:
         chosen, means = self.of.mask(state), state.means
         vector = F.normalize(torch.tensor(self.axis, dtype=torch.float64), dim=0) * math.radians(self.degrees)
         quat = rotate_left(torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64), vector[None])
         matrix = rotation_matrices(quat)[0].to(means)
-        pivots = _middles(state, chosen) if self.about is None else _from_world(state, self.about)
+        pivots = _centers(state, chosen) if self.about is None else _from_world(state, self.about)
         fields = {name: (x - pivots) @ matrix.T + pivots for name, x in _attributes(state, "point").items()}
         fields |= {name: x @ matrix.T for name, x in _attributes(state, "vector").items()}
         if state.quats is not None:
@@ -130,10 +130,10 @@ class Rotate(Operation):
 
 @dataclass(frozen=True)
 class Throw(Operation):
-    """Adds to the velocity of particles.
+    """Adds a velocity to particles.
 
     Attributes:
-        velocity: m/step.
+        velocity: added velocity in m/step.
     """
 
     velocity: Vector = (0.0, 0.0, 0.0)
@@ -142,10 +142,10 @@ class Throw(Operation):
     def apply(self, state: Particles, colors: Colors) -> Particles:
         chosen, table = self.of.mask(state), state.clouds
         if bool((state.activity[chosen] == FROZEN).any()):
-            raise InputError("frozen particles cannot be thrown; name others")
+            raise InputError("frozen particles cannot be thrown; select moving ones")
         newest = {table.scenes[q]: table.steps[q] for q in newest_clouds(table)}
         if len(newest) == len(table):
-            raise InputError("a history of one step holds no velocity; give the model two steps or more")
+            raise InputError("a history of one step has no velocity; encode two steps or more")
         ages = torch.tensor([newest[scene] - step for scene, step in zip(table.scenes, table.steps)])
         back = ages.to(state.means)[state.row_cloud()][:, None] * state.means.new_tensor(self.velocity)
         fields = {"means": state.means - back}
@@ -156,10 +156,10 @@ class Throw(Operation):
 
 @dataclass(frozen=True)
 class Recolor(Operation):
-    """Changes the mean colour of particles; light and shadow stay.
+    """Changes the mean colour of particles and keeps their shading.
 
     Attributes:
-        color: red, green and blue, 0 to 1.
+        color: red, green and blue in [0, 1].
     """
 
     color: Vector = (0.5, 0.5, 0.5)
@@ -168,7 +168,7 @@ class Recolor(Operation):
     def __post_init__(self):
         super().__post_init__()
         if not all(0 <= value <= 1 for value in self.color):
-            raise InputError(f"color must be three numbers from 0 to 1; got {list(self.color)}")
+            raise InputError(f"color must be three numbers in [0, 1]; got {list(self.color)}")
 
     def apply(self, state: Particles, colors: Colors) -> Particles:
         chosen = self.of.mask(state)
@@ -187,7 +187,7 @@ class Duplicate(Operation):
     """Adds a copy of particles.
 
     Attributes:
-        by: metres, from the particles to their copy.
+        by: displacement of the copy in metres.
     """
 
     by: Vector = (0.0, 0.0, 0.0)
@@ -201,11 +201,13 @@ class Duplicate(Operation):
 
 @dataclass(frozen=True)
 class Insert(Operation):
-    """Adds particles of another scene, whose newest step becomes the newest step here. Their appearance is not frozen.
+    """Adds the particles of another scene, with its newest step aligned to the newest step of the state.
+
+    The inserted particles are never in ``frozen_appearance``.
 
     Attributes:
-        particles: one scene, encoded or simulated by the same model. In a file ``scene`` names its folder.
-        by: metres, added to their positions there.
+        particles: one scene, encoded or simulated by the same model. A file of edits names its folder by ``scene``.
+        by: displacement in metres from their positions in the other scene.
     """
 
     particles: Particles | None = None
@@ -216,16 +218,16 @@ class Insert(Operation):
     def apply(self, state: Particles, colors: Colors) -> Particles:
         chosen, given = self.of.mask(self.particles), dataclasses.replace(self.particles, frozen_appearance=None)
         if len(newest_clouds(given.clouds)) != 1:
-            raise InputError("particles must be of one scene")
+            raise InputError("particles must be of a single scene")
         for field, value in given.row_fields().items():
             mine = getattr(state, field)
             if not ATTRIBUTES[field].is_optional and (mine is None or mine.shape[1:] != value.shape[1:]):
-                raise InputError(f"particles.{field} must be as those of the state; were they made by another model?")
+                raise InputError(
+                    f"particles.{field} differs in shape from the state; insert particles of the same model"
+                )
         given = given.select_rows(chosen).to(state.means.device)
-        table, newest = (
-            state.clouds,
-            {state.clouds.scenes[q]: state.clouds.steps[q] for q in newest_clouds(state.clouds)},
-        )
+        table = state.clouds
+        newest = {table.scenes[q]: table.steps[q] for q in newest_clouds(table)}
         ages = [given.clouds.steps[-1] - step for step in given.clouds.steps]
         runs = []
         for scene, step in zip(table.scenes, table.steps):
@@ -249,8 +251,8 @@ class Edit:
     """An operation at a step of a rollout.
 
     Attributes:
-        step: step of the rollout, from 0; the operation is applied before this step is predicted.
-        operation: the change.
+        step: step of the rollout, from 0; the operation is applied before the prediction of this step.
+        operation: operation to apply.
     """
 
     step: int
@@ -258,10 +260,11 @@ class Edit:
 
     @property
     def where(self) -> str:
+        """Step and operation, for error messages."""
         return f"edit at step {self.step}, {self.operation.name}"
 
     def apply(self, state: Particles, colors: Colors) -> Particles:
-        """The changed ``state``. Raises InputError that names step and operation."""
+        """Applies the operation. Errors name its step."""
         try:
             return self.operation.apply(state, colors)
         except InputError as error:
@@ -269,13 +272,15 @@ class Edit:
 
 
 def by_step(edits: Iterable[Edit], n_steps: int, *, insert: bool, remove: bool) -> dict[int, list[Edit]]:
-    """Edits by the step that they precede, ascending; those of one step in the given order.
+    """Step -> its edits in the given order, sorted by step.
 
     Args:
+        edits: edits in any order.
+        n_steps: steps of the rollout.
         insert: whether edits may add particles.
         remove: whether edits may remove particles.
     Raises:
-        InputError: an edit lies beyond ``n_steps``, or adds or removes particles although this is off.
+        InputError: a step is out of range, or an edit adds or removes particles although this is off.
     """
     found: dict[int, list[Edit]] = {}
     for edit in sorted(edits, key=lambda edit: edit.step):
@@ -289,18 +294,19 @@ def by_step(edits: Iterable[Edit], n_steps: int, *, insert: bool, remove: bool) 
 
 
 def structure_of(edits: Iterable[Edit]) -> StructureEffects:
-    """The structure of a spec that allows ``edits``."""
+    """Structure effects of a spec that allows ``edits``."""
     operations = [edit.operation for edit in edits]
     return StructureEffects(any(o.inserts for o in operations), any(o.removes for o in operations))
 
 
 def load_edits(path: str | Path, encode: Callable[[Path], Particles]) -> list[Edit]:
-    """The edits of a YAML file: a list of mappings with ``step``, ``op`` and the operation's fields.
+    """Reads edits from a YAML file: a list of mappings with ``step``, ``op`` and the fields of the operation.
 
     Args:
-        encode: scene folder -> its particles, for ``insert``; folders are relative to the file's.
+        path: YAML file. Scene folders are relative to its folder.
+        encode: scene folder -> particles, for ``insert``.
     Raises:
-        InputError: names file, step and operation.
+        InputError: an entry is invalid; the message names file, step and operation.
     """
     path = Path(path)
     values = enumerate(read_yaml(path, list))
@@ -329,7 +335,7 @@ def _edit(values: Any, where: str, folder: Path, encode: Callable[[Path], Partic
 
 
 def _changed(state: Particles, chosen: Tensor, fields: dict[str, Tensor]) -> Particles:
-    """``state`` with other values of the particles ``chosen`` (bool [N])."""
+    """Replaces attributes of the particles in the mask ``chosen`` (bool [N])."""
     mixed = {
         name: torch.where(chosen.reshape(-1, *[1] * (value.dim() - 1)), value, getattr(state, name))
         for name, value in fields.items()
@@ -343,19 +349,19 @@ def _moved(state: Particles, chosen: Tensor, by: Vector | Tensor) -> Particles:
 
 
 def _attributes(state: Particles, kind: str) -> dict[str, Tensor]:
-    """The attributes of ``kind`` that ``state`` has."""
+    """Attributes of ``state`` of this kind."""
     return {name: value for name, value in state.row_fields().items() if ATTRIBUTES[name].kind == kind}
 
 
 def _from_world(state: Particles, position: Vector) -> Tensor:
-    """[N, 3], a world ``position`` in the coordinates of each particle of ``state``."""
+    """World ``position`` relative to the world offset of each particle, [N, 3]."""
     offset = state.row_offset()
     position = torch.tensor(position, dtype=torch.float64, device=state.means.device).expand(state.n_rows, 3)
     return (position if offset is None else position - offset).to(state.means)
 
 
 def _between(there: Tensor | None, here: Tensor | None, by: Vector) -> Vector | Tensor:
-    """Displacement ``by`` of positions relative to ``there`` [3], as positions relative to ``here`` [N, 3]."""
+    """Displacement from coordinates with offset ``there`` [3] to those with offsets ``here`` [N, 3], plus ``by``."""
     if there is None and here is None:
         return by
     known = there if here is None else here
@@ -363,8 +369,8 @@ def _between(there: Tensor | None, here: Tensor | None, by: Vector) -> Vector | 
     return known.new_tensor(by) + there - here
 
 
-def _middles(state: Particles, chosen: Tensor) -> Tensor:
-    """[N, 3], for each particle the mean position of the ``chosen`` particles of the newest cloud of its scene."""
+def _centers(state: Particles, chosen: Tensor) -> Tensor:
+    """Mean position [N, 3] of the ``chosen`` particles in the newest cloud of each particle's scene."""
     scene = state.cloud_scene[state.row_cloud()]
     chosen = chosen & newest_mask(state)
     one = F.one_hot(scene, int(scene.max()) + 1).to(state.means)
@@ -373,7 +379,7 @@ def _middles(state: Particles, chosen: Tensor) -> Tensor:
 
 
 def _joined(state: Particles, more: Particles) -> Particles:
-    """The clouds of ``state``, each followed by the particles of the same cloud of ``more``."""
+    """Appends the particles of each cloud of ``more`` to the same cloud of ``state``."""
     parts = with_same_attributes([state, more])
     clouds = torch.cat([part.row_cloud() for part in parts])
     order = torch.argsort(clouds, stable=True)

@@ -1,4 +1,4 @@
-"""From what a scene calls for to what is computed, and what that costs."""
+"""Plans: what a simulator computes for a spec, and the predicted cost."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from gsim3d.nn.point_transformer import BLOCK_KERNEL, STEM_KERNEL
 from gsim3d.presets import ModelConfig
 from gsim3d.state import Particles
 
-# Of a surface in a grid, a convolution of K^3 taps finds about K^2 neighbours; a coarser grid keeps 1 / stride^2 rows.
+# Dimension of a surface in a grid: a kernel of K^3 taps has about K^2 neighbours; pooling keeps 1 / stride^2 particles.
 SURFACE = 2
-SPLATS_A_PIXEL = 30  # that are blended where there is a surface; multiply-adds of each, and of projecting a Gaussian
-BLENDING, PROJECTION = 12, 250
+SPLATS_A_PIXEL = 30  # Gaussians blended in a pixel
+BLENDING, PROJECTION = 12, 250  # multiply-adds of blending, and of projecting, a Gaussian
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a simulator computes for a spec. What is not in it runs no kernel and makes no buffer.
+    """What a simulator computes for a spec. Everything else launches no kernel and allocates no memory.
 
     Attributes:
-        spec: what the scene calls for.
-        history: steps that the model sees.
+        spec: effects of the scene.
+        history: steps in the model's input.
         sh_degree: degree of the spherical harmonics of rendered colours.
-        priors: types of the model's priors, in the order in which they apply.
+        priors: types of the model's priors in order of application.
         switches: (name, setting) of every effect that is on.
-        outputs: names of the images that are made.
-        unused: parameters of the model that the plan does not read, by name; a checkpoint need not have them.
+        outputs: names of the rendered images.
+        unused: names of parameters that the plan does not read; checkpoints may lack them.
     """
 
     spec: EffectsSpec
@@ -49,13 +49,13 @@ class Plan:
 
 @dataclass(frozen=True)
 class Workload:
-    """What a plan is applied to.
+    """Sizes of a scene, for cost predictions.
 
     Attributes:
-        moving: particles of one step that may move.
-        frozen: particles of one step that may not.
-        views: images of the step.
-        pixels: of one image.
+        moving: movable particles of a step.
+        frozen: frozen particles of a step.
+        views: images of a step.
+        pixels: pixels of an image.
     """
 
     moving: int
@@ -65,10 +65,10 @@ class Workload:
 
 
 def make_plan(spec: EffectsSpec, model: ModelConfig) -> Plan:
-    """The plan of a model for ``spec``.
+    """Returns the plan of a model for ``spec``.
 
     Raises:
-        UnsupportedEffect: the model cannot simulate an effect of ``spec``.
+        UnsupportedEffect: the model does not support an effect of ``spec``.
     """
     _check_supported(spec, model)
     dynamics, appearance, structure = spec.dynamics, spec.appearance, spec.structure
@@ -102,17 +102,17 @@ def _check_supported(spec: EffectsSpec, model: ModelConfig) -> None:
     refused = {
         "dynamics.background asymmetric": (
             dynamics.background == "asymmetric" and not model.dynamics.is_asymmetric,
-            "in this model frozen particles see all others",
+            "in this model frozen particles attend to all others",
         ),
         "dynamics.sleep.policy approx": (
             dynamics.sleep and dynamics.sleep.policy == "approx" and not model.dynamics.is_asymmetric,
-            "this model cannot tell sleepers from others (dynamics.background is symmetric); the policy exact it can",
+            "it needs a model with an asymmetric background; use the policy exact",
         ),
         "appearance.opacity_changes": (
-            spec.appearance.opacity_changes and not model.dynamics.explicit, "this model holds opacities"
+            spec.appearance.opacity_changes and not model.dynamics.explicit, "this model does not predict opacities"
         ),
         "outputs": (
-            not (outputs.rgb or outputs.depth or outputs.alpha or outputs.features), "there is no image to make"
+            not (outputs.rgb or outputs.depth or outputs.alpha or outputs.features), "no output is on"
         ),
         "outputs.features": (
             outputs.features and model.renderer.latents == 0, "this model's particles have no latents"
@@ -125,14 +125,14 @@ def _check_supported(spec: EffectsSpec, model: ModelConfig) -> None:
 
 def _up_to(name: str, asked: int | None, largest: int) -> int:
     if asked is not None and asked > largest:
-        raise UnsupportedEffect(f"unsupported effect {name}: this model goes up to {largest}; got {asked}")
+        raise UnsupportedEffect(f"unsupported effect {name}: this model supports at most {largest}; got {asked}")
     return largest if asked is None else asked
 
 
 def unused_parameters(plan: Plan, model: ModelConfig, names: Iterable[str]) -> tuple[str, ...]:
-    """Of the parameters ``names``, those that ``plan`` does not read."""
+    """Returns those of the parameters ``names`` that ``plan`` does not read."""
     config = model.dynamics
-    # A model that counts steps back from the newest reads every table of time embeddings.
+    # With slots counted from the newest step, all tables of time embeddings are used.
     bits = config.history_bits if config.slots_from_newest else (plan.history - 1).bit_length()
     merged = config.pyramid_spec(bits).merged_bits()
     tables = {f"dynamics.net.encoder.{s}.merge.time_embedding" for s, n in enumerate(merged) if n == 0}
@@ -140,10 +140,10 @@ def unused_parameters(plan: Plan, model: ModelConfig, names: Iterable[str]) -> t
 
 
 def predicted_cost(plan: Plan, model: ModelConfig, work: Workload) -> dict[str, float]:
-    """Multiply-adds of one simulated step and its images, by part: "dynamics", "gaussians" (the head) and "images".
+    """Multiply-adds of one simulated step and its images: "dynamics", "gaussians" (the head) and "images".
 
-    Counted from the sizes of layers, for particles on surfaces whose spacing is that of the grid, without what is not a
-    matrix product, an attention or a splat. Ratios of two plans of one model are meaningful; absolute numbers are not.
+    Counts matrix products, attention and splats, for particles on surfaces with the spacing of the grid. Ratios between
+    two plans of a model are meaningful; absolute numbers are not.
     """
     background = plan.spec.dynamics.background
     moving = work.moving + (work.frozen if background == "dynamic" else 0)
@@ -165,12 +165,12 @@ def predicted_cost(plan: Plan, model: ModelConfig, work: Workload) -> dict[str, 
 
 
 def background_cost(plan: Plan, model: ModelConfig, work: Workload) -> float:
-    """Multiply-adds of a background that is computed once a rollout; 0 if every step computes it."""
+    """Multiply-adds of a background that is computed once a rollout; 0 if each step computes it."""
     return _network(model.dynamics, work.frozen, 1) if _is_asymmetric(plan.spec, model) and work.frozen else 0.0
 
 
 def _network(config: DynamicsConfig, particles: float, history: int, context: float = 0.0) -> float:
-    """Multiply-adds of the dynamics network on ``particles``, which read features of ``context`` frozen ones."""
+    """Multiply-adds of the dynamics network on ``particles`` with a context of ``context`` frozen particles."""
     from gsim3d.dynamics.step import StateLayout
 
     layout, channels = StateLayout.of(config), config.encoder_channels
@@ -194,19 +194,19 @@ def _network(config: DynamicsConfig, particles: float, history: int, context: fl
 
 
 def _block(config: DynamicsConfig, particles: float, context: float, channels: int, patch: int) -> float:
-    """A particle attends to its own patch, and to one of frozen particles."""
+    """Multiply-adds of a block. A particle attends to its own patch and to one patch of the context."""
     dense = (BLOCK_KERNEL**SURFACE + 1 + 4 + 2 * config.mlp_ratio) * channels**2
     return particles * (dense + 2 * (min(particles, patch) + min(context, patch)) * channels)
 
 
 def by_plan(particles: Particles, plans: Sequence[Plan]) -> Iterator[tuple[Plan, list[int]]]:
-    """Each different plan, and the clouds of the scenes that it is for.
+    """Groups scenes by plan: yields each different plan with the clouds of its scenes.
 
     Args:
-        particles: of some scenes.
-        plans: one for each scene.
+        particles: particles of several scenes.
+        plans: one plan for each scene.
     Raises:
-        InputError: there are more plans than scenes, or fewer.
+        InputError: the number of plans differs from that of scenes.
     """
     n_scenes = particles.origin.shape[0]
     if len(plans) != n_scenes:

@@ -1,4 +1,4 @@
-"""Which particles of a scene are meant, by kind and position: for edits, and for a spec's frozen appearance."""
+"""Selections of particles by kind and position, for edits and for ``frozen_appearance``."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ KINDS = {"all": None, "moving": DYNAMIC, "frozen": FROZEN}
 
 @dataclass(frozen=True)
 class Selection:
-    """Which particles.
+    """A selection of particles.
 
     Attributes:
         which: "moving", "frozen" (the static background) or "all".
-        box: metres, lowest and highest corner in the world; None: everywhere.
+        box: lowest and highest corner in world coordinates (m); None: unlimited.
     """
 
     which: str = "moving"
     box: Box | None = None
 
-    alone: ClassVar[str] = "which"  # the field that a plain text in a file stands for
+    alone: ClassVar[str] = "which"  # field that a plain string in a file sets
 
     def __post_init__(self):
         if self.which not in KINDS:
@@ -43,10 +43,10 @@ class Selection:
             raise InputError(f"box must be the lowest and the highest corner; got {corners}")
 
     def mask(self, particles: Particles) -> Tensor:
-        """bool [N], the selected particles. Waits for the device, except in a CUDA graph, which raises no error.
+        """Mask bool [N] of the selected particles. Needs a device sync, except during graph capture.
 
         Raises:
-            InputError: the selection is empty in the newest step of every scene.
+            InputError: the selection is empty in the newest steps of all scenes; not checked during graph capture.
         """
         activity = KINDS[self.which]
         of_kind = particles.activity == activity if activity is not None else torch.ones_like(particles.activity) > 0
@@ -62,16 +62,16 @@ class Selection:
         return chosen
 
     def _empty(self, positions: Tensor) -> str:
-        """The message about an empty selection; particles of its kind are at ``positions``."""
+        """Message for an empty selection; ``positions`` are those of the particles of its kind."""
         message = f"the selection is empty: no particle is {self.which}"
         if self.box is None or not len(positions):
             return message
         corners = [[round(x, 2) for x in corner.tolist()] for corner in (positions.amin(0), positions.amax(0))]
-        return f"{message} in the box {[list(corner) for corner in self.box]}; theirs is {corners}"
+        return f"{message} in the box {[list(corner) for corner in self.box]}; their bounds are {corners}"
 
 
 def any_mask(selections: Iterable[Selection], particles: Particles, where: str) -> Tensor:
-    """bool [N], particles of any of ``selections``; errors as :meth:`Selection.mask`, and they name ``where``."""
+    """Mask bool [N] of the union of ``selections``. Errors of :meth:`Selection.mask` name ``where``."""
     chosen = torch.zeros_like(particles.activity, dtype=torch.bool)
     for number, selection in enumerate(selections):
         try:
@@ -82,7 +82,7 @@ def any_mask(selections: Iterable[Selection], particles: Particles, where: str) 
 
 
 def newest_mask(particles: Particles) -> Tensor:
-    """bool [N], particles of the newest cloud of each scene."""
+    """Mask bool [N] of the particles in the newest cloud of each scene."""
     table = particles.clouds
     newest = set(dict(zip(table.scenes, range(len(table)))).values())
     marks = torch.tensor([q in newest for q in range(len(table))], dtype=torch.bool, device=particles.cu_rows.device)

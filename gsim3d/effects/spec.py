@@ -1,4 +1,4 @@
-"""What a scene calls for: effects that are not asked for are not computed."""
+"""Specs of the effects of a scene. Effects that are off are not computed."""
 
 from __future__ import annotations
 
@@ -18,28 +18,26 @@ from gsim3d.io.files import read_yaml, shown, write_whole
 from gsim3d.io.settings import from_dict
 
 VERSION = 1
-FILE = "effects.yaml"  # of a scene or of a whole data set, in its folder
+FILE = "effects.yaml"  # in the folder of a scene or of a data set
 BACKGROUNDS = ("frozen", "masked_out", "dynamic", "asymmetric")
 CHANGING = ("all", "dynamic", "frozen", "none")
 POLICIES = ("exact", "approx")
-REMOVED = {"actions": "names", "contact": "pairs"}  # keys of dynamics in old files -> their list, which must be empty
+REMOVED = {"actions": "names", "contact": "pairs"}  # removed keys of old files -> their list, which must be empty
 
 
 class UnsupportedEffect(InputError):
-    """An effect that this model or this version cannot simulate; the message starts with "unsupported"."""
+    """The model or version does not support an effect; the message starts with "unsupported"."""
 
 
 @dataclass(frozen=True)
 class Sleep:
-    """When particles at rest are skipped.
+    """Sleep of particles at rest. See :mod:`gsim3d.dynamics.sleep`.
 
     Attributes:
-        policy: "exact": a scene sleeps as a whole; "approx": cubes of it do (:mod:`gsim3d.dynamics.sleep` has the
-            bounds).
-        eps: largest displacement per step of a particle at rest along an axis, in cells, and largest change of a
-            latent.
-        patience: steps at rest before a particle sleeps; at least as many as the model's history.
-        halo: metres, edge of the cubes, and the change of speed per step up to which no particle wakes too late.
+        policy: "exact": whole scenes sleep; "approx": cubes of space sleep.
+        eps: largest change a step of a particle at rest: displacement along an axis in cells, and latents.
+        patience: steps at rest before a particle sleeps; at least the model's history is used.
+        halo: edge of the cubes in metres. Particles wake in time if velocities change by less than this a step.
     """
 
     policy: str = "exact"
@@ -57,14 +55,14 @@ class Sleep:
 
 @dataclass(frozen=True)
 class DynamicsEffects:
-    """What moves.
+    """Effects of the dynamics.
 
     Attributes:
-        background: "frozen": particles marked frozen never move, and others see them; "asymmetric": the same, by a
-            model in which frozen particles see only each other, so that they are computed once a rollout;
-            "masked_out": they are left out; "dynamic": every particle may move.
-        history: steps that the model sees; None: as many as the model can use.
-        sleep: when particles at rest are skipped; None: never.
+        background: "frozen": frozen particles never move, and others attend to them; "asymmetric": the same with a
+            model whose frozen particles attend only to each other, and are computed once a rollout; "masked_out":
+            frozen particles are removed; "dynamic": all particles may move.
+        history: steps in the model's input; None: as many as the model supports.
+        sleep: sleep of particles at rest; None: off.
     """
 
     background: str = "frozen"
@@ -79,15 +77,15 @@ class DynamicsEffects:
 
 @dataclass(frozen=True)
 class AppearanceEffects:
-    """Which appearance changes with time and view.
+    """Effects of the appearance.
 
     Attributes:
         view_dependent: degree of the spherical harmonics, 0 to 3; None: the model's.
-        changing: particles whose dynamic latents change with time: "all", "dynamic", "frozen" (shadows fall on the
-            background, bodies keep their appearance) or "none".
-        opacity_changes: whether opacities change with time; None: where the model predicts them (explicit models do).
-        frozen_appearance: particles whose latents stay constant, whatever ``changing`` says. Resolved once, where a
-            rollout starts: a selected particle stays so wherever it moves.
+        changing: particles whose dynamic latents change with time: "all", "dynamic", "frozen" (for example shadows on
+            the background) or "none".
+        opacity_changes: whether opacities change with time; None: if the model predicts them (explicit models).
+        frozen_appearance: selections whose latents stay constant, whatever ``changing`` is; resolved once at the start
+            of a rollout.
     """
 
     view_dependent: int | None = None
@@ -105,7 +103,7 @@ class AppearanceEffects:
 
 @dataclass(frozen=True)
 class StructureEffects:
-    """Particles that come or go during a rollout (:mod:`gsim3d.effects.edits`).
+    """Changes of the number of particles during a rollout (:mod:`gsim3d.effects.edits`).
 
     Attributes:
         insert: whether edits may add particles.
@@ -118,13 +116,13 @@ class StructureEffects:
 
 @dataclass(frozen=True)
 class OutputEffects:
-    """Images to make, all in one pass.
+    """Rendered images, all from one pass.
 
     Attributes:
         rgb: colour.
-        depth: metres along the camera's axis.
-        alpha: coverage, 0 to 1.
-        features: the latents of the particles, blended like colour.
+        depth: depth along the optical axis in metres.
+        alpha: coverage in [0, 1].
+        features: latents of the particles, blended as colours.
     """
 
     rgb: bool = True
@@ -135,14 +133,14 @@ class OutputEffects:
 
 @dataclass(frozen=True)
 class EffectsSpec:
-    """What to compute of a scene. Effects that are absent are off; history, view_dependent and opacity_changes are then
-    the model's own.
+    """Effects to compute for a scene. Missing effects are off; history, view_dependent and opacity_changes then default
+    to the model's.
 
     Attributes:
-        dynamics: what moves.
-        appearance: which appearance changes with time and view.
+        dynamics: effects of the dynamics.
+        appearance: effects of the appearance.
         structure: whether edits may add and remove particles.
-        outputs: images to make.
+        outputs: rendered images.
 
     Example:
         >>> spec = EffectsSpec.from_dict({"dynamics": {"background": "masked_out", "history": 2}})
@@ -159,12 +157,12 @@ class EffectsSpec:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any] | None) -> EffectsSpec:
-        """The spec of nested plain values, those of older versions included.
+        """Returns the spec of nested plain values, also of older versions.
 
         Args:
-            values: as :meth:`to_dict` makes them; None: the default.
+            values: output of :meth:`to_dict`; None: the default spec.
         Raises:
-            InputError: a key is unknown or removed, or a value is of another type or out of range.
+            InputError: a key is unknown or removed, or a value has a wrong type or is out of range.
         """
         values = dict(values or {})
         version = values.pop("version", VERSION)
@@ -173,17 +171,17 @@ class EffectsSpec:
         return from_dict(cls, _converted(values), "effects: ")
 
     def to_dict(self) -> dict[str, Any]:
-        """Nested plain values, without what is off or left to the model."""
+        """Nested plain values that differ from the defaults."""
         return {"version": VERSION, **_differences(self)}
 
     @classmethod
     def load(cls, path: str | Path) -> EffectsSpec:
-        """The spec of the YAML (or JSON) file ``path``."""
+        """Reads a spec from a YAML or JSON file."""
         return cls.from_dict(read_yaml(path, dict | None))
 
     @classmethod
     def of_scene(cls, folder: str | Path) -> EffectsSpec | None:
-        """The spec of effects.yaml in ``folder``, of a scene, or up to two folders above (a whole set's); else None."""
+        """Reads effects.yaml in the folder of a scene, or up to two folders above; None if there is none."""
         folder = Path(folder).absolute()
         for around in (folder, folder.parent, folder.parent.parent):
             if (around / FILE).is_file():
@@ -191,19 +189,19 @@ class EffectsSpec:
         return None
 
     def save(self, path: str | Path) -> None:
-        """Writes ``path``, a YAML file, or JSON if the name ends in .json."""
+        """Writes a YAML file, or JSON if ``path`` ends in .json."""
         path = Path(path)
         as_json = path.suffix == ".json"
         write_whole(path, json.dumps(self.to_dict(), indent=2) if as_json else yaml.safe_dump(self.to_dict()))
 
     @property
     def hash(self) -> str:
-        """16 hex digits that two equal specs share, on any machine."""
+        """Hash of the spec, 16 hex digits, equal on all machines."""
         return hashlib.sha256(json.dumps(_whole(self.to_dict()), sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _converted(values: dict[str, Any]) -> dict[str, Any]:
-    """Plain values of an older version as those of today. Raises InputError where a removed effect was on."""
+    """Converts plain values of older versions. Raises InputError if a removed effect was on."""
     if isinstance(dynamics := values.get("dynamics"), dict):
         for name, what in REMOVED.items():
             old = dynamics.get(name)
@@ -233,7 +231,7 @@ def _at_least(name: str, value: Any, least: int) -> None:
 
 
 def _differences(value: Any) -> dict[str, Any]:
-    """Plain values of the fields of a dataclass that differ from those of a new one."""
+    """Plain values of the fields of a dataclass that differ from the defaults."""
     default, out = type(value)(), {}
     for f in dataclasses.fields(value):
         mine = getattr(value, f.name)
@@ -249,7 +247,7 @@ def _plain(value: Any) -> Any:
 
 
 def _whole(value: Any) -> Any:
-    """``value`` with integers for numbers that are whole: 1 and 1.0 are equal, and so must their hashes be."""
+    """Replaces floats with integer values by integers, so that 1 and 1.0 have equal hashes."""
     if isinstance(value, dict):
         return {name: _whole(item) for name, item in value.items()}
     if isinstance(value, list):

@@ -1,16 +1,16 @@
-"""The policy for numbers that cannot be used.
+"""Policies for invalid numbers.
 
 For every input, the simulator and every op return finite outputs and finite gradients, or raise a
-:class:`gsim3d.NumericalError` that names scene, step, particle or camera and tensor. A policy says which:
+:class:`gsim3d.NumericalError` that names scene, step, tensor, and particle or camera. The policies are:
 
-- ``"raise"`` (default): an error. The CPU raises immediately. A GPU does not wait: the particle sleeps as under "drop",
-  and the error is raised by the next call that finds its record, or by :meth:`StabilityReport.check`.
-- ``"drop"``: the particle sleeps. It keeps its position, the network does not see it, it is not drawn, and it has no
+- ``"raise"`` (default): raises an error. The CPU raises immediately. A GPU does not synchronize: it treats the particle
+  as "drop" does, and a later call, or :meth:`StabilityReport.check`, raises the error.
+- ``"drop"``: the particle falls asleep. It keeps its position, is invisible to the network and in images, and has no
   gradient.
-- ``"clamp"``: the number is bounded. NaN becomes the previous value, or 0 (a rotation the identity).
+- ``"clamp"``: bounds the number. NaN becomes the previous value, or 0 (a rotation: the identity).
 
-Under every policy a particle that leaves the workspace, or moves further in a step than ``max_speed``, falls asleep
-("clamp": stops at the limit); that is counted and no error. Nothing of this changes another scene by one bit.
+With every policy, a particle that leaves the workspace or moves by more than ``max_speed`` in a step falls asleep
+("clamp": stops at the limit), which the report counts and is no error. Other scenes keep equal bits.
 """
 
 from __future__ import annotations
@@ -26,37 +26,37 @@ from gsim3d.errors import InputError
 OnInvalid = Literal["raise", "drop", "clamp"]
 LARGEST = torch.finfo(torch.float32).max
 ACTIONS = {"raise": "error", "drop": "dropped", "clamp": "clamped"}
-NEAREST = 1e-6  # metres, smallest near plane
-FARTHEST = 1e9  # metres, largest far plane, and largest coordinate of a camera or origin
-PIXEL_SLACK = 1e-3  # colours may leave [0, 1] by as much: resampling rounds
+NEAREST = 1e-6  # smallest near plane in metres
+FARTHEST = 1e9  # largest far plane, and largest coordinate of a camera or origin, in metres
+PIXEL_SLACK = 1e-3  # tolerance of colours outside [0, 1], for rounding in resampling
 
 
 def check_on_invalid(on_invalid: str) -> None:
-    """Raises InputError where ``on_invalid`` is no policy."""
+    """Raises InputError if ``on_invalid`` is not a policy."""
     if on_invalid not in get_args(OnInvalid):
         raise InputError(f"on_invalid must be one of {', '.join(get_args(OnInvalid))}; got {on_invalid!r}")
 
 
 def at_most(values: Tensor, largest: float) -> Tensor:
-    """bool [N], for each of N entries whether all its numbers are finite and at most ``largest`` in size."""
+    """bool [N]: whether all numbers of each of ``values`` [N, ...] are finite and at most ``largest`` in magnitude."""
     return (values.detach().abs() <= largest).flatten(1).all(1)
 
 
 def usable_pixels(images: Tensor) -> Tensor:
-    """bool, for each number of ``images``: whether it is a colour in [0, 1]."""
+    """bool, shape of ``images``: whether a number is a colour in [0, 1]."""
     return (images >= -PIXEL_SLACK) & (images <= 1 + PIXEL_SLACK)
 
 
 @dataclass(frozen=True)
 class StabilityConfig:
-    """Limits of a model's particles, and what happens where one exceeds them.
+    """Limits of a model's particles, and the policy for particles beyond them.
 
     Attributes:
-        on_invalid: "raise", "drop" or "clamp": the policy where a call names no other.
-        max_speed: m/step. A particle that moves further falls asleep where it was. Less than a model's own ``max_step``
-            stops learned motion; far more lets a diverging particle drag others along before it leaves.
-        max_latent: largest size of a latent or colour coefficient; larger values count as not finite. From about 6e4
-            half precision overflows, from 1e19 a squared norm in float32.
+        on_invalid: default policy, "raise", "drop" or "clamp".
+        max_speed: largest displacement in m/step; faster particles fall asleep at their previous position. Should be
+            above the model's ``max_step``, and not far above, so that diverging particles do not affect others.
+        max_latent: largest magnitude of a latent or colour coefficient; larger values count as not finite. float16
+            overflows at about 6e4.
     """
 
     on_invalid: OnInvalid = "raise"

@@ -1,4 +1,4 @@
-"""The report of a validation: findings and statistics, collected without waiting for a GPU."""
+"""Reports of validations: findings and statistics, collected without device syncs."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ from torch import Tensor
 from gsim3d.errors import NumericalError
 
 ADVICE = 'on_invalid="drop" goes on without such particles, on_invalid="clamp" bounds them'
-MAX_FINDINGS = 1000  # kept by a report; later ones only count
-MAX_QUIET = 1000  # records kept unread
+MAX_FINDINGS = 1000  # findings stored in a report; later ones are only counted
+MAX_QUIET = 1000  # records without findings that are stored unread
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Particles or pixels of one tensor in one cloud or image that could not be used as they were.
+    """Invalid particles or pixels of one tensor in one cloud or image.
 
     Attributes:
-        what: what is wrong, such as "not finite", "outside the workspace", "speed limit".
-        where: the call, such as "encode" or "rollout".
-        tensor: what holds the numbers.
-        action: "error", "dropped", "clamped", "asleep" (by rule) or "noted".
-        count: how many.
-        row: index of the first one in the packed tensors of the call.
-        scene: of the particles' cloud.
-        step: of the particles' cloud.
-        camera: image of the call.
+        what: kind of finding, such as "not finite", "outside the workspace" or "speed limit".
+        where: call, such as "encode" or "rollout".
+        tensor: name of the tensor.
+        action: "error", "dropped", "clamped", "asleep" (limit exceeded) or "noted".
+        count: number of particles or pixels.
+        row: index of the first one in the packed tensor.
+        scene: scene of the cloud.
+        step: step of the cloud.
+        camera: index of the image.
     """
 
     what: str
@@ -56,20 +56,20 @@ class Finding:
         return f"{self.where}: {self.tensor}: {self.what}{row}{location}{more}"
 
     def error(self) -> NumericalError:
-        """The error that names the finding and says what to do."""
+        """Returns the error of this finding, with advice."""
         return NumericalError(
             f"{self}; {ADVICE}", tensor=self.tensor, scene=self.scene, step=self.step, row=self.row, camera=self.camera
         )
 
 
 class Statistics(NamedTuple):
-    """Sums over the particles of one scene at one step.
+    """Statistics of the particles of a scene at a step.
 
     Attributes:
-        awake: particles that may still change.
-        kinetic_energy: (m/step)^2, half the squared displacements in the step, for unit masses.
+        awake: number of awake particles.
+        kinetic_energy: half the sum of squared displacements in (m/step)^2, for unit masses.
         opacity_mass: sum of opacities.
-        extent: metres, diagonal of the bounds of the awake particles.
+        extent: diagonal of the bounding box of the awake particles in metres.
     """
 
     awake: int
@@ -79,20 +79,20 @@ class Statistics(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """The content of a record once the host can read it."""
+    """Content of a record on the host."""
 
     findings: Iterable[Finding]
     statistics: dict[tuple[int, int], Statistics]
 
 
 def pack(tensors: list[Tensor]) -> Tensor:
-    """int64 [M], the bits of ``tensors`` of 64-bit numbers in one: one copy takes all of them to the host."""
+    """Concatenates the bits of tensors of 64-bit numbers to int64 [M], for a single copy to the host."""
     flat = [tensor.reshape(-1).view(torch.int64) for tensor in tensors]
     return flat[0] if len(flat) == 1 else torch.cat(flat)
 
 
 class _Record(NamedTuple):
-    """Numbers of a validation on a GPU; fields as the arguments of :meth:`StabilityReport.record`."""
+    """A record of a validation on a GPU; the fields are the arguments of :meth:`StabilityReport.record`."""
 
     numbers: Any
     read: Callable[[Tensor], Reading]
@@ -101,7 +101,7 @@ class _Record(NamedTuple):
 
 
 def _numbers_of(records: Iterable[_Record]) -> list[Tensor]:
-    """All numbers in the order of the records; those that one function joins are in one tensor."""
+    """Tensors of the records in order, with consecutive records of the same ``join`` joined."""
     numbers = []
     for join, group in groupby(records, key=lambda record: record.join):
         own = [record.numbers for record in group]
@@ -110,13 +110,13 @@ def _numbers_of(records: Iterable[_Record]) -> list[Tensor]:
 
 
 def _read_packed(read: Callable, packed: Tensor, begin: int, shape: torch.Size, dtype: torch.dtype) -> Reading:
-    """The content of one record among others in ``packed``, from ``begin`` on."""
+    """Reads the record that begins at ``begin`` of ``packed``."""
     return read(packed[begin : begin + shape.numel()].view(dtype).view(shape))
 
 
 @dataclass
 class _Pending:
-    """Records on their way to the host: the copy is complete when the event is; None: it has arrived."""
+    """Records that are copied to the host; ``event`` ends the copy (None: complete)."""
 
     records: list[_Record]
     packed: Tensor
@@ -124,11 +124,11 @@ class _Pending:
 
 
 class StabilityReport:
-    """What was raised, dropped, clamped or put to sleep, where and how often. Calls that share a report add to it.
+    """Collects the findings and statistics of all calls that share it.
 
-    On a GPU a call adds a small record that is copied while the device works on; reading the report waits for it. In a
-    CUDA graph records are overwritten by every replay: :meth:`replayed` fetches them. A region of ``torch.compile``
-    records nothing; invalid particles sleep all the same.
+    On a GPU, a call adds a small record that is copied asynchronously; reading the report synchronizes. A replay of a
+    CUDA graph overwrites its records, which :meth:`replayed` fetches. Under ``torch.compile`` nothing is recorded, but
+    invalid particles still fall asleep.
 
     Attributes:
         is_closed: whether :meth:`close` was called.
@@ -145,35 +145,33 @@ class StabilityReport:
         self.clear()
 
     def __reduce__(self):
-        return StabilityReport, ()  # a copy of a model starts with an empty report
+        return StabilityReport, ()  # copies of a model start with an empty report
 
     def clear(self) -> None:
-        """Forgets everything."""
+        """Removes all findings, statistics and records."""
         self._found: dict[Finding, Finding] = {}
         self._total = 0
         self._errors: list[Finding] = []
         self._first_error: Finding | None = None
         self._statistics: dict[tuple[int, int], Statistics] = {}
         self._unsent: list[_Record] = []
-        self._stream: torch.cuda.Stream | None = None  # that computes what is unsent
+        self._stream: torch.cuda.Stream | None = None  # stream of the unsent records
         self._pending: deque[_Pending] = deque()
-        self._quiet: list[Callable[[], Reading]] = []  # readings without findings, whose statistics were not read yet
+        self._quiet: list[Callable[[], Reading]] = []  # records without findings, whose statistics are unread
         self._captured: list[_Record] = []
         self.is_closed = False
 
-    # ---- writing ----
-
     def close(self) -> None:
-        """Takes no further records: later findings are neither counted nor, in gradients, an error."""
+        """Ignores all later findings, including errors in gradients."""
         self.is_closed = True
 
     def add(self, finding: Finding) -> None:
-        """Counts ``finding``; those of the same kind and location become one."""
+        """Adds a finding; findings of the same kind and location are merged."""
         key = dataclasses.replace(finding, count=0, row=None)
         with self._lock:
             self._total += finding.count
             if finding.action == "error":
-                self._errors.append(finding)  # of this call alone, whose rows its message counts
+                self._errors.append(finding)  # unmerged, so that its message counts this call only
                 self._first_error = self._first_error or finding
             if known := self._found.get(key):
                 self._found[key] = dataclasses.replace(known, count=known.count + finding.count)
@@ -189,16 +187,15 @@ class StabilityReport:
         send: bool = True,
         join: Callable[[Sequence[Any]], Tensor] | None = None,
     ) -> None:
-        """Adds the counts of a validation: now on the CPU, which also raises; on a GPU when their copy has arrived.
+        """Adds the record of a validation. The CPU reads it immediately and may raise; a GPU copies it asynchronously.
 
         Args:
-            numbers: any small tensor of 64-bit numbers.
-            read: a copy of ``numbers`` on the host -> its content.
-            counts: indices into the flat ``numbers`` that are all 0 where there are no findings; a GPU's record is then
-                read only with :attr:`statistics`. Empty: it is read when it arrives.
-            send: copy it now; else with others by :meth:`send`, or when the report is read.
-            join: makes one tensor of several such ``numbers``, which are parts on a GPU, when they are copied; None:
-                they are whole.
+            numbers: small tensor of 64-bit numbers.
+            read: parses a copy of ``numbers`` on the host.
+            counts: indices into the flattened ``numbers`` of the counts of findings; if all are 0, a GPU's record is
+                read only for :attr:`statistics`. Empty: the record is always read.
+            send: whether to start the copy now; else :meth:`send` or a read of the report starts it.
+            join: joins several ``numbers``, which are partial results on a GPU, into one tensor; None: no join.
         """
         if self.is_closed:
             return
@@ -217,7 +214,7 @@ class StabilityReport:
                 self.send()
 
     def send(self) -> None:
-        """Begins to copy to the host what has been recorded on a GPU, all in one, without waiting."""
+        """Starts an asynchronous copy of all unsent records to the host."""
         if torch.compiler.is_compiling() or not self._unsent:
             return
         records, self._unsent = self._unsent, []
@@ -228,16 +225,15 @@ class StabilityReport:
                 self._send(records)
 
     def captured(self) -> list[Tensor]:
-        """The numbers that every replay of the CUDA graphs captured with this report overwrites; during a capture they
-        are joined within the graph."""
+        """Tensors of the records that a replay of the captured CUDA graphs overwrites. Call it during the capture."""
         return _numbers_of(self._captured)
 
     def replayed(self, to: StabilityReport | None = None, packed: Tensor | None = None) -> None:
-        """Fetches the records of the CUDA graphs captured with this report, without waiting; call it after a replay.
+        """Fetches the records of the captured CUDA graphs asynchronously. Call it after a replay.
 
         Args:
-            to: report that gets them, and the findings of this one so far; None: this one.
-            packed: the packed content of :meth:`captured` on the host, if the caller has it already.
+            to: report to which the records and all findings of this report are added; None: this report.
+            packed: packed content of :meth:`captured` on the host, if already copied.
         """
         target = self if to is None else to
         if self._captured and packed is not None:
@@ -279,7 +275,7 @@ class StabilityReport:
             if record.counts and not any([numbers[begin + index] for index in record.counts]):
                 self._quiet.append(reading)
             else:
-                self._read_quiet()  # steps in the order in which they came
+                self._read_quiet()  # in the order of steps
                 self._take(reading())
             begin += shape.numel()
         if len(self._quiet) > MAX_QUIET:
@@ -290,10 +286,8 @@ class StabilityReport:
         for reading in quiet:
             self._take(reading())
 
-    # ---- reading ----
-
     def poll(self) -> None:
-        """Raises the first error that has arrived and was not raised yet; waits for nothing."""
+        """Raises the first error that has arrived and was not raised yet, without a device sync."""
         if torch.compiler.is_compiling():
             return
         if (self._unsent or self._pending) and not torch.cuda.is_current_stream_capturing():
@@ -304,10 +298,10 @@ class StabilityReport:
             raise new[0].error()
 
     def check(self) -> None:
-        """Waits for the device and raises the first error of the report.
+        """Synchronizes and raises the first error of the report.
 
         Raises:
-            NumericalError: naming scene, step, row or camera and tensor, and what to do.
+            NumericalError: names scene, step, tensor, and row or camera, and says what to do.
         """
         self._collect(wait=True)
         if self._first_error is not None:
@@ -316,25 +310,25 @@ class StabilityReport:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """All findings, in the order in which they came; the first 1000."""
+        """The first 1000 findings in order."""
         self._collect(wait=True)
         return tuple(self._found.values())
 
     @property
     def total(self) -> int:
-        """Count of all findings together."""
+        """Sum of the counts of all findings."""
         self._collect(wait=True)
         return self._total
 
     @property
     def statistics(self) -> dict[tuple[int, int], Statistics]:
-        """(scene, step) -> statistics, of every step that was simulated."""
+        """(scene, step) -> statistics, for every simulated step."""
         self._collect(wait=True)
         self._read_quiet()
         return dict(sorted(self._statistics.items()))
 
     def to_dict(self) -> dict:
-        """Plain data: total and findings."""
+        """Total and findings as plain values."""
         return {"total": self.total, "findings": [vars(finding) for finding in self.findings]}
 
     def __str__(self) -> str:

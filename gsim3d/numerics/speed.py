@@ -1,4 +1,4 @@
-"""How a trained simulator is run, to trade accuracy for time; settings that were tuned lie in a file beside weights."""
+"""Settings that trade accuracy for time, and the file of tuned settings in a checkpoint's folder."""
 
 from __future__ import annotations
 
@@ -28,28 +28,28 @@ PRECISIONS = ("fp32", "tf32", "bf16", "fp16")
 DTYPES = {"bf16": torch.bfloat16, "fp16": torch.float16}
 PARTS = ("encoder", "dynamics", "renderer")
 SPEEDS = ("exact", "balanced", "fast")
-SPEEDS_FILE = "speeds.json"  # {digest of a checkpoint: {kind of device: {speed: setting}}}
+SPEEDS_FILE = "speeds.json"  # {digest of a checkpoint: {device type: {speed: setting}}}
 
 
 @dataclass(frozen=True)
 class Setting:
-    """How a trained simulator is run. The default is the reference: float32 throughout, nothing left out.
+    """Options of inference. The default is the reference: float32 without approximations.
 
     Attributes:
-        encoder: precision, "fp32", "tf32", "bf16" or "fp16"; positions, codes, splats and sums are float32 in all.
-        dynamics: the same.
-        renderer: the same.
-        captured: the rollout is replayed from a CUDA graph.
-        context_views: input cameras; None: as many as in training.
-        history: input steps; None: as many as in training.
-        background: as EffectsSpec.dynamics.background; None: that of the training.
-        kept: share of the particles of each step, moving and other ones alike, that is retained: the most opaque.
-        sh_degree: of rendered colours; None: the model's.
-        cutoff: as :func:`gsim3d.ops.rasterize_gaussians`.
-        patch_size: largest number of particles that attend to each other; None: the model's.
-        grid: factor to the model's cell size.
-        least_opacity: Gaussians below it are not drawn; pixels leave out what is below 1/255 in any case.
-        sleep: cells that a particle at rest moves in one step at most, and is not computed; None: as in training.
+        encoder: precision, "fp32", "tf32", "bf16" or "fp16"; positions, codes, splats and sums are always float32.
+        dynamics: precision of the dynamics.
+        renderer: precision of the renderer.
+        captured: replays the rollout from a CUDA graph.
+        context_views: input cameras; None: as in training.
+        history: input steps; None: as in training.
+        background: replaces ``EffectsSpec.dynamics.background``; None: as in training.
+        kept: fraction of particles that are retained, the most opaque of the moving and of the other ones.
+        sh_degree: degree of rendered colours; None: the model's.
+        cutoff: as in :func:`gsim3d.ops.rasterize_gaussians`.
+        patch_size: largest number of particles in a patch; None: the model's.
+        grid: factor on the model's cell size.
+        least_opacity: smallest opacity of rendered Gaussians; contributions below 1/255 are always skipped.
+        sleep: largest displacement of a particle at rest, which sleeps, in cells/step; None: as in training.
     """
 
     encoder: str = "fp32"
@@ -74,11 +74,11 @@ class Setting:
         check_ranges(self, kept=(1e-6, 1), grid=(1e-3, 1e3), least_opacity=(0, 1), sleep=(0, 1e3), sh_degree=(0, 3))
         check_ranges(self, **dict.fromkeys(("context_views", "history", "patch_size"), (1, 1e6)))
         if self.captured and self.sleep is not None:
-            raise InputError("captured does not fit sleep: a CUDA graph computes every particle")
+            raise InputError("captured does not fit sleep: a CUDA graph computes all particles")
 
     @property
     def name(self) -> str:
-        """What differs from the reference, in words."""
+        """Text of the options that differ from the reference."""
         changed = self.to_dict()
         if precisions := {changed.pop(part, "fp32") for part in PARTS} - {"fp32"}:
             parts = [part for part in PARTS if getattr(self, part) != "fp32"]
@@ -91,21 +91,21 @@ class Setting:
 
     @property
     def of_input(self) -> Setting:
-        """What of it changes the encoder's work."""
+        """The setting reduced to options of the encoder."""
         return Setting(encoder=self.encoder, context_views=self.context_views, history=self.history)
 
     def to_dict(self) -> dict[str, Any]:
-        """Fields that differ from the reference."""
+        """Options that differ from the reference."""
         return {f.name: v for f in dataclasses.fields(self) if (v := getattr(self, f.name)) != f.default}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Setting:
-        """Raises InputError for an unknown key or a value of another type."""
+        """Inverse of :meth:`to_dict`. Raises InputError for unknown keys and wrong types."""
         return from_dict(cls, values, "setting: ")
 
     @contextlib.contextmanager
     def precision(self, part: str, device: str) -> Iterator[None]:
-        """A context in which ``part`` computes as the setting says, and convolutions repeat bit by bit."""
+        """Context with the precision of ``part`` and deterministic convolutions."""
         precision, products = getattr(self, part), torch.backends.cuda.matmul
         tf32, before = precision == "tf32", products.allow_tf32
         autocast = torch.autocast(device, DTYPES.get(precision, torch.float32), enabled=precision in DTYPES)
@@ -118,14 +118,14 @@ class Setting:
             products.allow_tf32 = before
 
     def of_model(self, config: ModelConfig) -> ModelConfig:
-        """The model in the geometry of the setting; weights fit all."""
+        """The model's configuration with the cell and patch sizes of this setting; weights are unchanged."""
         dynamics = config.dynamics
         patches = tuple(min(size, self.patch_size or size) for size in dynamics.patch_sizes)
         changed = dataclasses.replace(dynamics, grid_size=dynamics.grid_size * self.grid, patch_sizes=patches)
         return config if changed == dynamics else dataclasses.replace(config, dynamics=changed)
 
     def of_effects(self, spec: EffectsSpec, is_asymmetric: bool) -> EffectsSpec:
-        """What a model that was trained for ``spec`` computes."""
+        """Spec of a model trained for ``spec`` under this setting."""
         sleep = spec.dynamics.sleep
         if self.sleep is not None:
             sleep = Sleep(policy="approx" if is_asymmetric else "exact", eps=self.sleep)
@@ -141,13 +141,13 @@ class Setting:
         return dataclasses.replace(spec, dynamics=dynamics, appearance=appearance)
 
     def of_inputs(self, inputs: InputSpec) -> InputSpec:
-        """What is encoded, of the ``inputs`` of the training."""
+        """Input spec under this setting, from that of the training."""
         views = min(self.context_views or inputs.context_views, inputs.context_views)
         history = min(self.history or inputs.history, inputs.history)
         return dataclasses.replace(inputs, context_views=views, history=history)
 
     def retained(self, particles: Particles) -> Particles:
-        """The most opaque share of the moving and of the other particles of each cloud."""
+        """Selects the fraction ``kept`` of moving and of other particles in each cloud, the most opaque ones."""
         if self.kept == 1:
             return particles
         group = 2 * particles.row_cloud() + (particles.activity == DYNAMIC)
@@ -161,13 +161,13 @@ class Setting:
 
 
 def encode(simulator: Any, source: Frames | FrameSource) -> Particles:
-    """The particles from which :func:`predict` simulates. Raises InputError for images of another size."""
+    """Encodes frames to the initial state of :func:`predict`. Raises InputError for a wrong image size."""
     inputs = InputSpec() if simulator.inputs is None else simulator.inputs
     frames = source if isinstance(source, Frames) else source.input_frames(inputs)
     size = (frames.cameras.width, frames.cameras.height)
     if inputs.image_size and size != tuple(inputs.image_size):
         wanted = "x".join(map(str, inputs.image_size))
-        raise InputError(f"predict: images must be of {wanted} pixels, as in training; got {size[0]}x{size[1]}")
+        raise InputError(f"predict: images must be {wanted} pixels, as in training; got {size[0]}x{size[1]}")
     setting, device = simulator.setting, next(simulator.parameters()).device
     frames = frames.subsample(inputs.background_stride, inputs.body_stride).to(device)
     with setting.precision("encoder", device.type):
@@ -184,7 +184,7 @@ def predict(
     edits: Sequence[Edit],
     **options: Any,
 ) -> Prediction:
-    """:meth:`gsim3d.Simulator.predict`, as the setting of the simulator says; ``options`` are those of the rollout."""
+    """:meth:`gsim3d.Simulator.predict` under the simulator's setting; ``options`` go to the rollout."""
     if steps < 1:
         raise InputError(f"predict: steps must be at least 1; got {steps}")
     state = source if isinstance(source, Particles) else encode(simulator, source)
@@ -203,7 +203,7 @@ def predict(
 def draw(
     simulator: Any, particles: Particles, cameras: Cameras, background: torch.Tensor | None, plan: Plan
 ) -> Rendering:
-    """Images of particles that ``simulator`` predicted, as its setting says."""
+    """Renders predicted particles under the simulator's setting."""
     setting = simulator.setting
     if setting.least_opacity:
         particles = particles.select_rows(particles.opacities >= setting.least_opacity)
@@ -212,10 +212,10 @@ def draw(
 
 
 def read_speeds(folder: Path) -> dict[str, Any]:
-    """All that is tuned in ``folder``, a mapping by digest of a checkpoint and kind of device; empty where nothing is.
+    """Reads the tuned settings of ``folder``: {digest: {device type: {speed: setting}}}, empty without a file.
 
     Raises:
-        InputError: the file is damaged.
+        InputError: the file is invalid.
     """
     path = folder / SPEEDS_FILE
     if not path.is_file():
@@ -230,15 +230,15 @@ def read_speeds(folder: Path) -> dict[str, Any]:
 
 
 def load_speed(folder: Path, digest: str | None, device: str, speed: str) -> Setting:
-    """The setting that was tuned for a checkpoint in ``folder`` on this kind of device.
+    """Reads the tuned setting of a checkpoint for a device.
 
     Args:
-        folder: of the weights.
-        digest: that names the checkpoint.
+        folder: folder of the checkpoint.
+        digest: digest of the checkpoint.
         device: "cpu" or "cuda".
         speed: one of SPEEDS.
     Raises:
-        InputError: it was not tuned; the message says how to.
+        InputError: the checkpoint is not tuned for this device.
     """
     if speed not in SPEEDS:
         raise InputError(f"speed: must be one of {', '.join(SPEEDS)}; got {speed!r}{did_you_mean(speed, SPEEDS)}")

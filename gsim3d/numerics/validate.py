@@ -1,4 +1,4 @@
-"""Validation of data that enters the simulator or leaves a step: invalid values are counted and sanitized."""
+"""Validation of frames, particles and predicted steps: counts and sanitizes invalid values."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from gsim3d.ops.validate_state import CELLS, FAST, OUTSIDE, join_records, valida
 from gsim3d.state import ASLEEP, ATTRIBUTES, CloudTable, Particles
 
 BOUNDED = {"opacities": "outside [0, 1]", "scales": "negative or not finite"}
-ALWAYS = ("means", "opacities")  # are validated, changed or not
-_WATCHED = "gsim3d.validated"  # mark of a node of an autograd graph whose gradients are validated
+ALWAYS = ("means", "opacities")  # validated even if unchanged
+_WATCHED = "gsim3d.validated"  # metadata key of autograd nodes whose gradients are validated
 
 
 class _Checks(NamedTuple):
-    """How the attributes of particles are validated.
+    """Bounds and finding kinds of a validation.
 
     Attributes:
         bounds: (lowest, highest) value of each attribute.
-        kinds: (tensor, what is wrong, action) of every kind that the kernel counts.
-        neutral: first number of the replacement of an invalid value without a previous one; others are 0.
+        kinds: (tensor, what, action) of every finding that the kernel counts.
+        neutral: first number of the replacement of an invalid value without a previous value; the others are 0.
     """
 
     bounds: list[tuple[float, float]]
@@ -66,23 +66,23 @@ def validate_particles(
     changed: Collection[str] | None = None,
     max_opacity: float = 1.0,
 ) -> Particles:
-    """``particles`` with finite, bounded values; invalid particles are handled by ``config.on_invalid``.
+    """Returns ``particles`` with finite, bounded values, by the policy ``config.on_invalid``.
 
     Args:
         particles: any clouds.
         config: policy and limits.
-        report: gets a finding for every kind of invalid value and, with ``previous``, statistics of every cloud.
+        report: receives findings and, with ``previous``, statistics of every cloud.
         where: name of this call in the report.
-        grid_size: metres, edge of a cell: a particle outside the 2^16 cells from its scene's origin falls asleep; 0: no
-            such limit.
-        previous: the same particles one step before: those that moved further than ``config.max_speed`` fall asleep,
-            and invalid ones return to it.
-        changed: attributes that differ from ``previous``; others are not validated again. None: all.
-        max_opacity: larger opacities are out of range.
+        grid_size: edge of a cell in metres; particles outside the 2^16 cells from their scene's origin fall asleep. 0:
+            no limit.
+        previous: the same particles one step before. Particles that moved by more than ``config.max_speed`` fall
+            asleep; invalid values are replaced by previous ones.
+        changed: attributes that may differ from ``previous``; only these are validated. None: all.
+        max_opacity: largest valid opacity.
     Raises:
-        NumericalError: ``config.on_invalid`` is "raise", on the CPU.
+        NumericalError: particles are invalid and ``config.on_invalid`` is "raise" (on the CPU).
     Gradients:
-        Through all valid particles. On the CPU a backward pass raises where the gradient of an invalid particle is not
+        Through valid particles. On the CPU, the backward pass raises if the gradient of an invalid particle is not
         finite, unless ``report`` is closed.
     """
     fields = {
@@ -93,8 +93,8 @@ def validate_particles(
     checks = (_checks if torch.compiler.is_compiling() else _cached_checks)(tuple(fields), config, max_opacity)
     before = None if previous is None else [getattr(previous, name) for name in fields]
     clamps = config.on_invalid == "clamp"
-    on_gpu = particles.means.is_cuda and not torch.compiler.is_compiling()  # the report gets its record later
-    # the copies that the kernel sanitizes carry no gradients
+    on_gpu = particles.means.is_cuda and not torch.compiler.is_compiling()  # asynchronous record
+    # The kernel's sanitized copies carry no gradients.
     in_kernel = not clamps and not (
         torch.is_grad_enabled() and any(value.requires_grad for value in (*fields.values(), *(before or ())))
     )
@@ -137,10 +137,10 @@ def validate_particles(
 def validate_frames(
     frames: Frames, config: StabilityConfig, report: StabilityReport, where: str
 ) -> tuple[Frames, Tensor | None]:
-    """``frames`` with pixels in [0, 1], and bool [I, H, W]: pixels that must not become particles (None: all may).
+    """Returns ``frames`` with pixels in [0, 1], and the mask bool [I, H, W] of dropped pixels (None: none).
 
-    Invalid pixels become 0 or, under the policy "clamp", the nearest colour. "raise" leaves them to the encoder, which
-    validates all other fields of ``frames`` under every policy.
+    Invalid pixels become 0 or, with the policy "clamp", the nearest colour. With "raise" the encoder raises, which also
+    validates all other fields of ``frames``.
     """
     images = frames.images
     if config.on_invalid == "raise":
@@ -153,20 +153,21 @@ def validate_frames(
     return dataclasses.replace(frames, images=images), bad if config.on_invalid == "drop" else None
 
 
-_OF_SCENES = ("origin", "world_offset")  # float64, one row a scene
+_OF_SCENES = ("origin", "world_offset")  # float64 [n_scenes, 3]
 
 
 def check_particles(particles: Particles, where: str, dtype: torch.dtype, widths: dict[str, int]) -> None:
-    """Checks what :func:`validate_particles` does not: types, shapes, offsets, indices, origins and choices.
+    """Checks types, shapes, offsets, indices and origins, which :func:`validate_particles` does not.
 
     Args:
+        particles: particles to check.
         where: name of this call in messages.
-        dtype: of the network, and so of the particles.
-        widths: channels of attributes that the network reads.
+        dtype: dtype of the network.
+        widths: attribute -> number of channels that the network reads.
     Raises:
-        InputError: the message names the field and what it must be.
-        NumericalError: an origin, or an attribute that steps do not validate, is not finite or too large; not checked
-            on a GPU, where particles far from their origin sleep.
+        InputError: a field has a wrong type, shape, device or value.
+        NumericalError: an origin, or an attribute that steps do not validate, is not finite or too large. Not checked
+            on a GPU, where such particles fall asleep.
     """
     if torch.compiler.is_compiling():
         return
@@ -225,7 +226,7 @@ def _check_choices(particles: Particles, where: str) -> None:
 
 
 def drop_particles(particles: Particles, dropped: Tensor) -> Particles:
-    """``particles`` of which those in ``dropped`` (bool [N]) sleep and are not drawn."""
+    """Puts the particles in the mask ``dropped`` (bool [N]) to sleep and makes them invisible."""
     return dataclasses.replace(
         particles,
         opacities=torch.where(dropped, 0.0, particles.opacities),
@@ -244,7 +245,7 @@ def _read_images(frames: Frames, where: str, action: str, counts: Tensor) -> Rea
 
 
 def _read(clouds: CloudTable, where: str, checks: _Checks, moved: bool, record: Tensor) -> Reading:
-    """The content of a record of the kernel."""
+    """Parses a record of the kernel."""
     findings, statistics, n_counts = [], {}, 2 * len(checks.kinds)
     for scene, step, numbers in zip(clouds.scenes, clouds.steps, record.tolist(), strict=True):
         if any(numbers[:n_counts:2]):
@@ -261,12 +262,12 @@ def _read(clouds: CloudTable, where: str, checks: _Checks, moved: bool, record: 
 
 @functools.lru_cache(maxsize=64)
 def _count_indices(n_clouds: int, n_columns: int, n_kinds: int) -> tuple[int, ...]:
-    """Indices of the counts of invalid particles in a flat record of the kernel."""
+    """Indices of the counts in a flattened record of the kernel."""
     return tuple(q * n_columns + 2 * k for q in range(n_clouds) for k in range(n_kinds))
 
 
 def _with_fields(particles: Particles, fields: dict[str, Tensor]) -> Particles:
-    """dataclasses.replace, which calls __init__, in a quarter of the time."""
+    """:func:`dataclasses.replace` without __init__, in a quarter of the time."""
     if torch.compiler.is_compiling():
         return dataclasses.replace(particles, **fields)
     made = object.__new__(Particles)
@@ -275,16 +276,16 @@ def _with_fields(particles: Particles, fields: dict[str, Tensor]) -> Particles:
 
 
 def _validate_gradients(values: Iterable[Tensor], finding: Finding, report: StabilityReport) -> None:
-    """Makes a backward pass through ``values`` raise where what it computes is not finite.
+    """Registers hooks that raise if a gradient behind ``values`` is not finite.
 
-    Sanitized particles have a gradient of 0, which becomes NaN where the value before them overflowed.
+    Sanitized particles have the gradient 0, which becomes NaN behind an overflowed value.
     """
 
     def check(gradients, _):
         if not report.is_closed and not all(bool(g.isfinite().all()) for g in gradients if g is not None):
             raise NumericalError(
                 f"{finding}, {finding.action}, and gradients behind it are not finite; correct the inputs of its scene "
-                "or leave it out, or go on under torch.no_grad()",
+                "or leave it out, or use torch.no_grad()",
                 tensor=finding.tensor,
                 scene=finding.scene,
                 step=finding.step,
@@ -301,7 +302,7 @@ def _validate_gradients(values: Iterable[Tensor], finding: Finding, report: Stab
 
 
 def _neutral(name: str, particles: Particles) -> Tensor:
-    """The replacement of an invalid value that has no previous one."""
+    """Replacements of invalid values of an attribute without previous values."""
     value = getattr(particles, name)
     if name == "means":
         return particles.origin[particles.cloud_scene[particles.row_cloud()]].to(value)
@@ -328,7 +329,7 @@ def _put_to_sleep(
 def _clamped_means(
     means: Tensor, particles: Particles, status: Tensor, max_speed: float, grid_size: float, previous: Particles | None
 ) -> Tensor:
-    """Positions, finite ones, at the limit of the speed and inside of the workspace."""
+    """Clamps positions to the speed limit and to the workspace."""
     if previous is not None:
         step = means - previous.means
         length = step.double().norm(dim=1, keepdim=True)

@@ -1,6 +1,6 @@
-"""Hand-made physics: priors that a learned dynamics may be given, each a module with attributes, inputs and gains.
+"""Priors: hand-made physics for the learned dynamics, each a module with attributes, features and gains.
 
-A model has none by default. ``DynamicsConfig.priors`` lists those of a model, in the order in which they apply.
+``DynamicsConfig.priors`` lists the priors of a model in order of application. It is empty by default.
 """
 
 from gsim3d.priors.base import Motion, Prior, PriorConfig, PriorList, StepContext

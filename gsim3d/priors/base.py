@@ -1,4 +1,4 @@
-"""What priors have in common: their settings, what a step shares among them, and what they may do to it."""
+"""Base classes of priors: their configuration, the context that they share in a step, and their interface."""
 
 from __future__ import annotations
 
@@ -16,24 +16,26 @@ from gsim3d.nn.point_transformer import STEM_KERNEL, SparseConv
 from gsim3d.priors.movable import Movable, Windows
 from gsim3d.state import Particles, newest_clouds, take_runs, with_attribute
 
-MAX_GAIN = 2.0  # a gain is within plus and minus this
+MAX_GAIN = 2.0  # gains are bounded to [-MAX_GAIN, MAX_GAIN]
 
 
 @dataclass(frozen=True)
 class PriorConfig:
-    """Settings of a prior. A subclass defines its ``type``, by which lists in YAML name it; a subclass of
-    :class:`Prior` that names it is what :meth:`build` makes.
+    """Base class of the configuration of a prior.
+
+    A subclass defines ``type``, the name of the prior in YAML lists. ``class MyPrior(Prior, config=MyConfig)`` makes
+    :meth:`build` return a ``MyPrior``.
 
     Attributes:
-        type: of the prior, which is also its name in a model.
-        version: of the meaning of the settings; another one than the class's is refused.
+        type: type of the prior, also its name in a model.
+        version: version of the settings; any other than the class's is refused.
     """
 
     type: str = ""
     version: int = 1
 
     VARIANTS: ClassVar[dict] = {}
-    RANGES: ClassVar[dict] = {}  # of settings, both ends included
+    RANGES: ClassVar[dict] = {}  # setting -> (smallest, largest) allowed value
     PRIOR: ClassVar[Any] = None
 
     def __init_subclass__(cls, **kwargs):
@@ -51,19 +53,19 @@ class PriorConfig:
         check_ranges(self, **known.RANGES)
 
     def build(self) -> Prior:
-        """The module with these settings and its first weights."""
+        """Returns a prior with these settings and initial weights."""
         return self.PRIOR(self)
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Displacements [N, 3] of one step in metres, in the parts that priors rewrite in order.
+    """Displacements [N, 3] of one step in metres, as four terms that the priors rewrite in order.
 
     Attributes:
-        inertial: what goes on by itself.
-        gained: what predicted gains make of known motions.
-        elastic: towards the rest shape; moves no body as a whole.
-        network: what the network predicts freely.
+        inertial: displacement without forces.
+        gained: sum of known motions, weighted by the predicted gains.
+        elastic: displacement towards the rest shape; moves no body as a whole.
+        network: displacement that the network predicts directly.
     """
 
     inertial: Tensor
@@ -73,26 +75,28 @@ class Motion:
 
     @classmethod
     def of_network(cls, network: Tensor) -> Motion:
+        """A motion whose other terms are zero."""
         zero = torch.zeros_like(network)
         return cls(zero, zero, zero, network)
 
     def total(self) -> Tensor:
+        """The sum of the four terms."""
         return self.network + ((self.inertial + self.gained) + self.elastic)
 
 
 class StepContext:
-    """What priors share in one step, each part computed on first use.
+    """Quantities that the priors share in one step, each computed on first use.
 
     Attributes:
-        history: clouds sorted by (scene, step).
-        newest: indices of the newest cloud of each scene.
-        state: their particles, N.
-        grid_size: metres, edge of a cell of the network.
-        max_steps: of a history.
-        priors: of the model.
-        changes: which particles a step changes, by attribute: "all", "dynamic", "frozen" or "none".
-        n_views: images of each encoded cloud; None: not known to be as many for all.
-        awake: bool [N], particles that the network saw; None: all. Known after the network has run.
+        history: input particles [M], clouds sorted by (scene, step).
+        newest: index of the newest cloud of each scene.
+        state: particles [N] of the newest clouds.
+        grid_size: edge of a network cell in metres.
+        max_steps: largest number of steps in a history.
+        priors: priors of the model.
+        changes: attribute -> particles that a step changes: "all", "dynamic", "frozen" or "none".
+        n_views: images of each encoded cloud; None: not known to be equal for all clouds.
+        awake: bool [N], particles that the network received; None: all. Set after the network has run.
     """
 
     def __init__(
@@ -114,66 +118,71 @@ class StepContext:
 
     @property
     def state(self) -> Particles:
-        return self.once("state", lambda: self.history.select_clouds(self.newest))
+        return self.cached("state", lambda: self.history.select_clouds(self.newest))
 
     @property
     def movable(self) -> Movable:
-        return self.once("movable", lambda: Movable(self.history, self.grid_size, self._most_movable))
+        return self.cached("movable", lambda: Movable(self.history, self.grid_size, self._most_movable))
 
     @property
     def is_empty(self) -> bool:
-        """Whether the newest clouds have no particles; then there is nothing movable to ask for."""
+        """Whether the newest clouds have no particles. ``movable`` is then undefined."""
         return all(begin == end for begin, end in self.runs)
 
     def windows(self, radius: float) -> Windows:
-        """Windows of standard deviation ``radius`` metres around the movable particles; of segmented particles each is
-        a body, whose particles count as much as the surface that they stand for."""
+        """Gaussian windows of standard deviation ``radius`` metres around the movable particles.
+
+        With segmentation, each window is one body, and samples are weighted by the inverse of their density.
+        """
         segmented = self.history.body is not None
         make = lambda: Windows(self.movable, self.history, radius, evenly=segmented)  # noqa: E731
-        return self.once(("windows", radius), make)
+        return self.cached(("windows", radius), make)
 
-    def once(self, key: Any, make: Callable[[], Any]) -> Any:
-        """What ``make`` returns, made at most once a step for each ``key``."""
+    def cached(self, key: Any, make: Callable[[], Any]) -> Any:
+        """Returns ``make()``, computed at most once a step for each ``key``."""
         if key not in self._shared:
             self._shared[key] = make()
         return self._shared[key]
 
-    def later(self, particles: Particles) -> StepContext:
-        """The context of other particles of the same model."""
+    def with_particles(self, particles: Particles) -> StepContext:
+        """A context of the same model for other particles."""
         most = self._most_movable
         return StepContext(particles, self.priors, self.grid_size, self.max_steps, most_movable=most)
 
-    def of_newest(self, values: Tensor) -> Tensor:
-        """[N, ...], of ``values`` of all particles of the history those of ``state``."""
+    def select_newest(self, values: Tensor) -> Tensor:
+        """Selects the values of the newest clouds: [M, ...] -> [N, ...]."""
         return take_runs(values, self.runs)
 
-    def of_all(self, values: Tensor, other: float = 0.0) -> Tensor:
-        """``values`` [N, ...] of ``state`` at their places among all particles of the history, ``other`` elsewhere."""
-        return put_runs(values, self.runs, self.history.n_rows, other)
+    def scatter_newest(self, values: Tensor, fill: float = 0.0) -> Tensor:
+        """Scatters values of the newest clouds to all particles: [N, ...] -> [M, ...], ``fill`` elsewhere."""
+        return put_runs(values, self.runs, self.history.n_rows, fill)
 
     def share(self, attribute: str, changed: str | None = None) -> Tensor:
-        """[N, 1], 1 for particles whose ``attribute`` this step changes, 0 for others.
+        """Mask [N, 1] in the dtype of positions: 1 for particles whose ``attribute`` this step changes.
 
-        changed: as an entry of ``changes``; None: that of the attribute.
+        Args:
+            attribute: name of the attribute.
+            changed: replaces its entry of ``changes``.
         """
         return self._share(self.state, attribute, changed or self.changes[attribute], self.awake)
 
 
 class Prior(nn.Module):
-    """A hand-made part of a step. All methods have defaults that do nothing.
+    """Base class of priors. The default methods do nothing.
 
-    Weights are zero at first: a prior that is added to a trained model changes nothing but what it does without gains.
+    Projections start at zero: a prior added to a trained model has its effect without gains, and no other.
 
     Attributes:
-        name: its type, and the name of its weights below ``dynamics.priors``.
-        attributes: of particles, which it needs; absent ones begin at their defaults.
-        requires: types of priors that must come before it.
-        n_conv_features, n_features: channels of what it gives the network.
-        n_gains: channels that the network predicts for it.
-        gains_change: the attribute that they change; where a plan keeps that, they are not computed.
-        replaces_displacement: whether the network predicts no displacement besides gains.
-        latent_only: whether it needs a model that is not explicit.
-        reads_background: whether it needs a model whose steps see frozen particles, as asymmetric ones do not.
+        name: type of the prior, and name of its weights below ``dynamics.priors``.
+        attributes: particle attributes that it uses; missing ones are created with their defaults.
+        requires: types of priors that must precede it in the list.
+        n_conv_features: channels of :meth:`conv_features`.
+        n_features: channels of :meth:`features`.
+        n_gains: channels of gains that the network predicts for it.
+        gains_change: attribute that the gains change; they are not computed if a plan keeps it constant.
+        replaces_displacement: whether the network predicts gains only, and no displacement.
+        latent_only: whether it does not support explicit models.
+        reads_background: whether it needs frozen particles in the history, which asymmetric models leave out.
     """
 
     attributes: tuple[str, ...] = ()
@@ -194,11 +203,11 @@ class Prior(nn.Module):
 
     @property
     def acts(self) -> bool:
-        """Whether it takes part in a step, beside what it gives the network."""
+        """Whether it changes a step, and not only the input of the network."""
         return type(self).move is not Prior.move or type(self).finish is not Prior.finish
 
     def connect(self, stem_channels: int, head_channels: int) -> None:
-        """Makes the projections between the network and what this prior gives and takes, all zero."""
+        """Creates the zero-initialised projections of features into the stem and of the head into gains."""
         if self.n_conv_features:
             self.conv_proj = SparseConv(self.n_conv_features, stem_channels, STEM_KERNEL, bias=False)
         if self.n_features:
@@ -209,34 +218,34 @@ class Prior(nn.Module):
             nn.init.zeros_(parameter)
 
     def initialize(self, particles: Particles, ctx: StepContext, frames: Frames | None = None) -> Particles:
-        """``particles`` after they were encoded from ``frames`` or, without ``frames``, after an edit."""
+        """Initializes attributes of ``particles`` that were encoded from ``frames``, or edited (``frames`` None)."""
         return particles
 
     def begin(self, particles: Particles, ctx: StepContext) -> Particles:
-        """``particles`` with the attributes of this prior, before a step."""
+        """Returns ``particles`` with the attributes of this prior. Called before each step."""
         for name in self.attributes:
             particles = with_attribute(particles, name)
         return particles
 
     def conv_features(self, ctx: StepContext) -> Tensor:
-        """[M, n_conv_features] of all M particles of the history, convolved with their neighbours'."""
+        """Features [M, n_conv_features] of the history, projected into the stem by a sparse convolution."""
         raise TypeError(f"{type(self).__name__} has n_conv_features and must define conv_features()")
 
     def features(self, ctx: StepContext) -> Tensor:
-        """[M, n_features] of all M particles of the history, read particle by particle."""
+        """Features [M, n_features] of the history, projected into the stem by a linear layer."""
         raise TypeError(f"{type(self).__name__} has n_features and must define features()")
 
     def move(self, motion: Motion, gains: Tensor, ctx: StepContext) -> Motion:
-        """``motion`` as this prior leaves it; gains [N, n_gains] as predicted, without bounds."""
+        """Returns the updated motion. ``gains`` [N, n_gains] are the unbounded outputs of the network."""
         return motion
 
     def finish(self, step: Particles, gains: Tensor, ctx: StepContext) -> Particles:
-        """``step``, the state after the motion, with the attributes that this prior predicts."""
+        """Updates the attributes of this prior in ``step``, the state after the motion."""
         return step
 
 
 class PriorList(nn.Module):
-    """The priors of a model in order, each registered under its name."""
+    """Priors of a model in order of application, each registered under its name."""
 
     def __init__(self, priors: Sequence[Prior] = ()):
         super().__init__()
@@ -255,24 +264,29 @@ class PriorList(nn.Module):
         return len(self._modules)
 
     def get(self, name: str) -> Prior | None:
-        """The prior of that name; None where the model has none."""
+        """The prior of that name, or None."""
         return self._modules.get(name)
 
 
 def bounded(x: Tensor, limit: float | None) -> Tensor:
-    """``x`` pressed into plus and minus ``limit``; None: as it is."""
+    """``limit * tanh(x)``; None: ``x``."""
     return x if limit is None else limit * torch.tanh(x)
 
 
+def hold(share: Tensor, newest: Tensor, later: Tensor) -> Tensor:
+    """``newest`` where ``share`` is 0, with the same bits and no gradient into ``later``; else ``later``."""
+    return torch.where(share > 0, later, newest)
+
+
 def bounded_gains(gains: Tensor) -> Tensor:
-    """Gains [N, 3 n] as factors [N, n, 3] within plus and minus ``MAX_GAIN``."""
+    """Network outputs [N, 3 n] as gains [N, n, 3] in [-MAX_GAIN, MAX_GAIN]."""
     return bounded(gains / MAX_GAIN, MAX_GAIN).unflatten(1, (-1, 3))
 
 
-def put_runs(x: Tensor, runs: Sequence[tuple[int, int]], n_rows: int, other: float = 0.0) -> Tensor:
-    """[n_rows, ...], the rows of ``x`` one run after another; ``other`` elsewhere."""
+def put_runs(x: Tensor, runs: Sequence[tuple[int, int]], n_rows: int, fill: float = 0.0) -> Tensor:
+    """Places the rows of ``x`` in the ranges ``runs`` of [n_rows, ...], with ``fill`` elsewhere."""
     pieces, end = [], 0
     for part, (begin, until) in zip(x.split([until - begin for begin, until in runs]), runs, strict=True):
-        pieces += [x.new_full((begin - end, *x.shape[1:]), other), part]
+        pieces += [x.new_full((begin - end, *x.shape[1:]), fill), part]
         end = until
-    return torch.cat([*pieces, x.new_full((n_rows - end, *x.shape[1:]), other)])
+    return torch.cat([*pieces, x.new_full((n_rows - end, *x.shape[1:]), fill)])

@@ -1,4 +1,4 @@
-"""Contact response: the static background stops what would get behind it, with friction."""
+"""Contact response: non-penetration of the static background, with Coulomb friction."""
 
 from __future__ import annotations
 
@@ -15,19 +15,20 @@ from gsim3d.priors.rigid import SMALLEST, RigidFit
 
 @dataclass(frozen=True)
 class ContactConfig(PriorConfig):
-    """Non-penetration of the static background.
+    """Contact with the static background.
 
     Attributes:
-        friction: Coulomb coefficient, at first; it is learned.
-        offset: metres over the background at which particles stop, at first; learned: they are seen inside of bodies.
-        offset_unit: metres, of the parameter: training changes it by little.
-        rigid: what stops some particles of a body stops it as a whole in the same step.
-        radius: metres, standard deviation of the windows that are a body.
-        exponent: gained displacements move bodies as a whole as far as proximity to the background to this power.
-        min_opacity: of particles that stop a rigid body; fainter ones lie outside of the bodies that they are seen of.
-        iterations: in which a rigid body gets out of the background.
-        max_scale: of the correction of one iteration over its mean.
-        min_speed: metres a step along a surface; slower particles are held.
+        friction: initial Coulomb coefficient; learned.
+        offset: initial contact offset in metres: particles stop at this height. Learned, because encoded particles lie
+            below the surface of their body.
+        offset_unit: metres a unit of the offset parameter; scales its learning rate.
+        rigid: corrects a body as a whole by the rigid part of its contact corrections.
+        radius: standard deviation in metres of the windows around bodies.
+        exponent: gained displacements move a body as a whole with weight ``proximity ** exponent``.
+        min_opacity: smallest opacity of particles in contact, if ``rigid``; fainter ones may lie outside their body.
+        iterations: rigid corrections a step.
+        max_scale: largest over-relaxation factor of a rigid correction.
+        min_speed: tangential speed in m/step below which a particle in contact sticks.
     """
 
     type = "contact"
@@ -56,13 +57,13 @@ class ContactConfig(PriorConfig):
 
 
 class Contact(Prior, config=ContactConfig):
-    """Let h be the height of a particle over the plane of the background near it, n its normal, d its displacement. The
-    normal component is clamped, d_n >= -max(h - offset, 0); the tangential part shrinks by at most friction times what
-    the normal part lost. If ``rigid``, these corrections are projected on the rigid motions of the body.
+    """Let h be the height of a particle over the local plane of the background, n the normal, and d the displacement.
+    The normal component is clamped, d_n >= -max(h - offset, 0). The tangential component is reduced by at most friction
+    times the change of the normal component. If ``rigid``, the corrections are projected on rigid motions of the body.
 
-    Internal forces conserve momentum: of elastic displacements, and of gained ones away from the background, the rigid
-    part in the window of the body is taken out. The network predicts gains only: how stiff and damped bodies are, and
-    not where they go.
+    Internal forces conserve momentum: the rigid part of elastic displacements, and of gained displacements away from
+    the background, is removed. The network predicts gains only, so it controls stiffness and damping of bodies and not
+    their path.
     """
 
     requires = ("segmentation", "proximity", "inertia")
@@ -82,13 +83,14 @@ class Contact(Prior, config=ContactConfig):
 
 
 class ContactSolver:
-    """Displacements of the newest particles of a step that do not enter the background.
+    """Projects displacements of the newest particles so that they do not enter the background.
 
     Args:
-        ctx: of the step.
-        geometry: of the background near the movable particles.
-        config: of :class:`Contact`.
-        friction, offset: numbers, of which gradients are taken.
+        ctx: context of the step.
+        geometry: background near the movable particles.
+        config: configuration of :class:`Contact`.
+        friction: Coulomb coefficient [], differentiable.
+        offset: contact offset [] in metres, differentiable.
     """
 
     def __init__(
@@ -102,19 +104,17 @@ class ContactSolver:
             (self._centers,) = self._windows.to_particles(self._body.center)
         height, self._normal = geometry.surface(self._centers)
         self._stops = ctx.state.opacities.detach()[:, None] >= config.min_opacity if config.rigid else None
-        # For gradients: a particle that is stopped comes to the same height wherever it was, and a higher one is less
-        # near.
+        # Zero in the forward pass: gradients of height and proximity with respect to positions.
         raised = ((means - means.detach()) * self._normal).sum(1, keepdim=True)
         self._height = height + raised - offset
         power = config.exponent
         self._near = geometry.proximity**power * (1 - power / geometry.range**2 * height * raised)
 
     def displacements(self, inertial: Tensor, gained: Tensor, elastic: Tensor) -> Tensor:
-        """[N, 3] metres in a step.
+        """Displacements [N, 3] in metres after the contact response.
 
         Gradients:
-            of all three, of friction and offset, and of positions as far as they decide where particles stop and
-        how near the background they are.
+            To all three terms, friction, offset, and positions by way of height and proximity.
         """
         with torch.autocast(inertial.device.type, enabled=False):
             internal = (1 - self._near) * gained + elastic
@@ -124,7 +124,7 @@ class ContactSolver:
             return moves + self._correction(moves)
 
     def _rigid_correction(self, corrections: Tensor) -> Tensor:
-        """The rigid part of ``corrections``, scaled so that the squares of what its particles still lack are least."""
+        """Rigid part of ``corrections``, scaled by the factor that minimises the squared remaining corrections."""
         moves = self._rigid_part(corrections)
         with torch.no_grad():
             lacking, done = (self._windows.mean((corrections * x).sum(1, keepdim=True)) for x in (corrections, moves))
@@ -132,14 +132,14 @@ class ContactSolver:
         return scale * moves
 
     def _rigid_part(self, moves: Tensor) -> Tensor:
-        """[N, 3], of ``moves`` the rigid motion of the window around each particle."""
+        """Rigid motion [N, 3] fitted to ``moves`` in the window of each particle."""
         movable = self._movable
-        found = self._body.fit(movable.samples.take(movable.padded(moves)))
+        found = self._body.fit(movable.samples.take(movable.gather(moves)))
         moved, spin = self._windows.to_particles(*found)
-        return movable.packed(moved + torch.linalg.cross(spin, movable.positions - self._centers))
+        return movable.scatter(moved + torch.linalg.cross(spin, movable.positions - self._centers))
 
     def _correction(self, moves: Tensor) -> Tensor:
-        """[N, 3], what stops ``moves`` at the surface, with friction. A particle behind it may stay there."""
+        """Correction [N, 3] that stops ``moves`` at the surface, with friction; penetrating particles may stay."""
         into = (moves * self._normal).sum(1, keepdim=True)
         stop = torch.minimum((-into).clamp(min=0), (-self._height - into).clamp(min=0))
         along = moves - into * self._normal

@@ -1,4 +1,4 @@
-"""Gravity: what touches nothing falls, and what is predicted counts only near a contact."""
+"""Gravity: ballistic motion in flight; predicted displacements apply only in contact."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ class GravityConfig(PriorConfig):
     """Acceleration of movable particles.
 
     Attributes:
-        acceleration: metres a step squared, at first; it is learned.
-        unit: metres a step squared, of the parameter: training changes it by little.
-        radius: metres, standard deviation of the windows in which a touch counts; about the radius of a body.
-        exponent: a particle touches as far as proximity to the background to this power.
-        touch: mean of that in a window, from which on its particles touch in full.
+        acceleration: initial acceleration in m/step^2; learned.
+        unit: m/step^2 a unit of the parameter; scales its learning rate.
+        radius: standard deviation in metres of the windows that average contact; about the radius of a body.
+        exponent: contact weight of a particle is ``proximity ** exponent``.
+        touch: window mean of the contact weight that counts as full contact.
     """
 
     type = "gravity"
@@ -41,13 +41,12 @@ class GravityConfig(PriorConfig):
     def __post_init__(self):
         super().__post_init__()
         if len(self.acceleration) != 3:
-            raise InputError(f"gravity: acceleration must be three numbers; got {list(self.acceleration)}")
+            raise InputError(f"gravity: acceleration must have three components; got {list(self.acceleration)}")
 
 
 class Gravity(Prior, config=GravityConfig):
-    """The inertial displacement grows by the acceleration in every step. With t from 0 for bodies in flight to 1 for
-    those that touch the background anywhere, what is predicted counts t times: flight is ballistic, and a contact
-    changes how the whole body moves.
+    """Adds the acceleration to the inertial displacement, and multiplies the gained and network displacements by a
+    contact weight t from 0 (in flight) to 1 (some particles of the window touch the background).
     """
 
     requires = ("proximity", "inertia")
@@ -58,17 +57,17 @@ class Gravity(Prior, config=GravityConfig):
 
     @property
     def step(self) -> Tensor:
-        """[3] metres a step squared."""
+        """Acceleration [3] in m/step^2."""
         return self.config.unit * self.acceleration
 
     def touch(self, ctx: StepContext) -> Tensor:
-        """[N, 1], t."""
+        """Contact weight t [N, 1]."""
         near = ctx.priors.get("proximity").geometry(ctx).proximity ** self.config.exponent
         with torch.autocast(near.device.type, enabled=False):
             return (ctx.windows(self.config.radius).mean(near) / self.config.touch).clamp(max=1)
 
     def fall(self, ctx: StepContext) -> Tensor:
-        """[N, 3] metres a step squared, the acceleration of particles in flight."""
+        """Acceleration [N, 3] in m/step^2, weighted by 1 - t."""
         return (1 - self.touch(ctx)) * self.step
 
     def move(self, motion: Motion, gains: Tensor, ctx: StepContext) -> Motion:

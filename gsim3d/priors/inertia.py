@@ -1,4 +1,4 @@
-"""Inertia: particles go on with the rigid motion of those around them, unless predicted gains change it."""
+"""Inertia: particles continue the rigid motion of their window, modified by predicted gains."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from gsim3d.state import Particles
 
 @dataclass(frozen=True)
 class InertiaConfig(PriorConfig):
-    """Rigid motions of windows, which go on.
+    """Rigid velocity field of the movable particles.
 
     Attributes:
-        radius: metres, standard deviation of the windows; about the radius of a body.
-        rotate_appearance: whether what is drawn turns with the particles around it. Needs a latent model.
+        radius: standard deviation in metres of the windows; about the radius of a body.
+        rotate_appearance: rotates Gaussians with their window. Not for explicit models.
     """
 
     type = "inertia"
@@ -31,10 +31,10 @@ class InertiaConfig(PriorConfig):
 
 
 class Inertia(Prior, config=InertiaConfig):
-    """Let V be three displacements a step of each particle: of the window around it, of the rigid motion of that window
-    if it goes on and turns as one body, and its own last one. The inertial displacement is V_2, and predicted gains
-    g [3, 3] add sum_k g_k V_k along each axis. What a contact did to some particles of a body in the last step is part
-    of the momentum of the body at once, and gradients flow through velocities.
+    """Let V_1 be the mean displacement of the window of a particle in the last step, V_2 the displacement if the rigid
+    motion of the window continues, and V_3 the particle's own last displacement. The inertial displacement is V_2, and
+    predicted gains g [3, 3] add sum_k g_k V_k (elementwise). An impulse on some particles of a body changes the rigid
+    motion of the whole body in the next step. Gradients flow through velocities.
     """
 
     n_conv_features, n_features, n_gains = 6, 3, 9
@@ -45,14 +45,14 @@ class Inertia(Prior, config=InertiaConfig):
         self.attributes = ("velocity", "orientations") if config.rotate_appearance else ("velocity",)
 
     def velocities(self, ctx: StepContext) -> Tensor:
-        """[N, 3, 3] metres a step, V."""
-        return ctx.once("velocities", lambda: _velocities(ctx.windows(self.config.radius), ctx.state.velocity))
+        """V [N, 3, 3] in m/step."""
+        return ctx.cached("velocities", lambda: _velocities(ctx.windows(self.config.radius), ctx.state.velocity))
 
     def conv_features(self, ctx: StepContext) -> Tensor:
-        return ctx.of_all(self.velocities(ctx)[:, :2]).flatten(1) / ctx.grid_size
+        return ctx.scatter_newest(self.velocities(ctx)[:, :2]).flatten(1) / ctx.grid_size
 
     def features(self, ctx: StepContext) -> Tensor:
-        return ctx.of_all(self.velocities(ctx)[:, 2:]).flatten(1) / ctx.grid_size
+        return ctx.scatter_newest(self.velocities(ctx)[:, 2:]).flatten(1) / ctx.grid_size
 
     def move(self, motion: Motion, gains: Tensor, ctx: StepContext) -> Motion:
         velocities = self.velocities(ctx)
@@ -68,19 +68,26 @@ class Inertia(Prior, config=InertiaConfig):
 
 
 def _velocities(windows: Windows, own: Tensor) -> Tensor:
-    """[N, 3, 3] metres a step, for particles whose own last displacement is ``own`` [N, 3]."""
+    """V [N, 3, 3] in m/step of particles whose last displacement is ``own`` [N, 3]."""
     movable = windows.movable
     with torch.autocast(own.device.type, enabled=False):
         found = windows.to_particles(*_rigid_motion(windows, own, since=True))
-        rigid = movable.packed(found[0]), movable.packed(next_displacement(movable.positions, *found))
+        rigid = movable.scatter(found[0]), movable.scatter(next_displacement(movable.positions, *found))
     return torch.stack([*rigid, own], 1)
 
 
 def _rigid_motion(windows: Windows, moved: Tensor, since: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """The displacement of each window, its spin (rad) and its center, [B, G, 3] each, of particles that moved by
-    ``moved`` [N, 3], from where they are or, ``since`` then, to there."""
+    """Fits rigid motions to displacements ``moved`` [N, 3] in each window.
+
+    Args:
+        windows: windows around the movable particles.
+        moved: displacements in metres.
+        since: whether ``moved`` ends at the current positions (else it starts there).
+    Returns:
+        Displacement (m), spin (rad) and center (m) of each window at the current positions, [B, G, 3] each.
+    """
     samples, half = windows.movable.samples, -0.5 if since else 0.5
-    paths = samples.take(windows.movable.padded(moved))
+    paths = samples.take(windows.movable.gather(moved))
     body = RigidFit(windows.weights, samples.positions + half * paths, windows.radius)
     velocity, fitted = body.fit(paths)
     return velocity, spin_of(fitted), body.center - half * velocity
@@ -88,8 +95,8 @@ def _rigid_motion(windows: Windows, moved: Tensor, since: bool) -> tuple[Tensor,
 
 @torch.no_grad()
 def rotate_with_window(windows: Windows, orientations: Tensor, moved: Tensor) -> Tensor:
-    """[N, 4] (w, x, y, z), ``orientations`` after a step by ``moved`` [N, 3], turned with the particles around each."""
+    """Rotates ``orientations`` [N, 4] (w, x, y, z) by the spin of the displacements ``moved`` [N, 3] in each window."""
     with torch.autocast(moved.device.type, enabled=False):
         _, spin, _ = _rigid_motion(windows, moved, since=False)
         (spin,) = windows.to_particles(spin)
-        return rotate_left(orientations, windows.movable.packed(spin))
+        return rotate_left(orientations, windows.movable.scatter(spin))

@@ -1,4 +1,4 @@
-"""Lighting: how much light of distant lamps reaches each particle, now and when it was encoded."""
+"""Lighting: irradiance of particles under directional lights, relative to the time of encoding."""
 
 from __future__ import annotations
 
@@ -13,36 +13,36 @@ from torch.nn import functional as F
 
 from gsim3d.cameras import Frames
 from gsim3d.errors import InputError
-from gsim3d.priors.base import Prior, PriorConfig, StepContext, bounded
+from gsim3d.priors.base import Prior, PriorConfig, StepContext, bounded, hold
 from gsim3d.priors.movable import Movable
 from gsim3d.priors.padding import LEAST_LOGIT, Compact, Samples, from_blocks, gaussian, in_blocks, squared_distances
 from gsim3d.priors.rigid import SMALLEST, fit_planes
 from gsim3d.state import DYNAMIC, FROZEN, Particles
 
-# Standard deviations of windows, in cells.
-FLAT = 2.5  # in which a surface is a plane
-BODY = 12.5  # whose mean is inside a body: that is how a surface knows its outside
-TOWARDS = 1.5  # cells: a surface with as many particles on both sides shows the light its front
-START = 3.0  # cells above a movable surface, where its rays begin: its own particles would be in their way
-EDGE_LAYERS = 0.7  # surfaces, as a ray meets in its window at the edge of a body
-SOFT = 0.15  # cosine by which a face that is turned away is lit still: normals are not exact
-EDGE = 0.5  # cells, over which particles on a ray begin to count
-NEAREST = 3.0  # cells towards the light, from which on particles count half; closer ones are the particle's own surface
+# Lengths in cells.
+FLAT = 2.5  # standard deviation of the windows of plane fits
+BODY = 12.5  # standard deviation of the windows whose mean is inside a body, to orient normals
+TOWARDS = 1.5  # bias of normals towards the light, for surfaces with as many particles on both sides
+START = 3.0  # height over a movable surface at which shadow rays start, to avoid self-shadowing
+EDGE = 0.5  # width of the sigmoid with which particles on a ray begin to count
+NEAREST = 3.0  # distance along a ray at which particles count half; closer ones belong to the same surface
+EDGE_LAYERS = 0.7  # number of surfaces on a ray that halves its light
+SOFT = 0.15  # softening of the cosine n.l at the terminator, since normals are not exact
 
 
 @dataclass(frozen=True)
 class DirectionalLightConfig(PriorConfig):
-    """Distant lamps, whose directions and strengths are learned.
+    """Directional lights with learned directions and strengths.
 
     Attributes:
-        directions: towards the lamps, at first.
-        shading: "lambert": surfaces are lit by n.l and shadows; "occlusion": by what is between them and the lamp only.
-        strength: of lamps at first: of "lambert" their irradiance over that from everywhere; of "occlusion" the
-            logarithm of how much darker a particle is where log(1 + n) of the particles in its light grows by one.
-        unit: length of the parameter that is a direction; longer ones turn more slowly in training.
-        beam: cells, standard deviation of the rays in which particles are counted.
-        min_opacity: of particles that are part of surfaces ("lambert").
-        max_gain: limit of the logarithm of what is predicted besides.
+        directions: initial directions towards the lights.
+        shading: "lambert": n.l with shadows; "occlusion": optical depth towards the light only.
+        strength: initial strength. "lambert": irradiance over that of the ambient light; "occlusion": extinction, the
+            decrease of the log irradiance as log(1 + n) grows by one, with n particles on the ray.
+        unit: norm of the direction parameters; a larger norm lowers their learning rate.
+        beam: standard deviation of the Gaussian ray that counts particles, in cells.
+        min_opacity: smallest opacity of particles on surfaces ("lambert").
+        max_gain: bound of the predicted log gain.
     """
 
     type = "directional_light"
@@ -66,7 +66,7 @@ class DirectionalLightConfig(PriorConfig):
     def __post_init__(self):
         super().__post_init__()
         if not self.directions or any(len(light) != 3 or not any(light) for light in self.directions):
-            raise InputError(f"directional_light: directions must be vectors (x, y, z); got {self.directions}")
+            raise InputError(f"directional_light: directions must be nonzero vectors (x, y, z); got {self.directions}")
         if self.shading not in ("lambert", "occlusion"):
             raise InputError(f'directional_light: shading must be "lambert" or "occlusion"; got {self.shading!r}')
 
@@ -75,10 +75,10 @@ class DirectionalLightConfig(PriorConfig):
 
 
 class _Light(Prior, ABC):
-    """Colours of a particle are multiplied by its irradiance now over that when it was encoded.
+    """Multiplies the colours of a particle by its irradiance now over that at encoding.
 
-    ``light_occlusion`` holds, for L lamps, columns of the time of encoding, then L of now; the network sees the last L
-    and the first L. Sleeping particles keep theirs.
+    For L lights, ``light_occlusion`` [N, n_columns] holds the values at encoding, then L current values. The features
+    are the last L and the first L columns. Sleeping particles keep their values.
     """
 
     attributes = ("irradiance_gain",)
@@ -92,18 +92,18 @@ class _Light(Prior, ABC):
 
     @abstractmethod
     def occlusion(self, ctx: StepContext, known: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Columns at encoding, if that were now, and columns of now; ``known``: those of ``ctx.state`` so far."""
+        """Values at encoding, if the state were just encoded, and current values. ``known``: light_occlusion so far."""
 
     @abstractmethod
     def log_gain(self, occlusion: Tensor) -> Tensor:
-        """[N, 3], the logarithm of the irradiance now over that at encoding."""
+        """Log of the current irradiance over that at encoding, [N, 3]."""
 
     def initialize(self, particles: Particles, ctx: StepContext, frames: Frames | None = None) -> Particles:
-        """``particles`` whose newest clouds know their light; its time of encoding defaults to now."""
+        """Sets ``light_occlusion`` of the newest clouds. Values at encoding default to the current ones."""
         known = particles.light_occlusion
         with torch.no_grad():
-            found = self._updated(ctx.later(particles), None if known is None else ctx.of_newest(known))
-            return replace(particles, light_occlusion=ctx.of_all(found, -1.0))
+            found = self._updated(ctx.with_particles(particles), None if known is None else ctx.select_newest(known))
+            return replace(particles, light_occlusion=ctx.scatter_newest(found, -1.0))
 
     def begin(self, particles: Particles, ctx: StepContext) -> Particles:
         if particles.light_occlusion is None:
@@ -112,17 +112,17 @@ class _Light(Prior, ABC):
 
     def features(self, ctx: StepContext) -> Tensor:
         known, n = ctx.state.light_occlusion, len(self.config.directions)
-        return ctx.of_all(torch.cat([known[:, -n:], known[:, :n]], 1))
+        return ctx.scatter_newest(torch.cat([known[:, -n:], known[:, :n]], 1))
 
     def finish(self, step: Particles, gains: Tensor, ctx: StepContext) -> Particles:
-        # At the places after the step: with the light of before shadows would lag behind their bodies.
-        found = self._updated(ctx.later(step), ctx.state.light_occlusion)
+        # At the positions after the step, so that shadows do not lag one step behind their bodies.
+        found = self._updated(ctx.with_particles(step), ctx.state.light_occlusion)
         gain = self._gain(ctx, self.log_gain(found), gains)
         return replace(step, light_occlusion=found, irradiance_gain=gain)
 
     @abstractmethod
     def _gain(self, ctx: StepContext, log_gain: Tensor, predicted: Tensor | None) -> Tensor:
-        """[N, 3]; not relative to the step before, or its errors would add up."""
+        """Irradiance gain [N, 3] since encoding. A gain since the previous step would accumulate errors."""
 
     def _updated(self, ctx: StepContext, known: Tensor | None) -> Tensor:
         n = len(self.config.directions)
@@ -137,13 +137,9 @@ class _Light(Prior, ABC):
         return torch.cat([began, now], 1)
 
 
-def _held(share: Tensor, before: Tensor, later: Tensor) -> Tensor:
-    return torch.where(share > 0, later, before)
-
-
 class OcclusionLight(_Light):
-    """Transmittance: let n count the movable particles between a particle and a lamp. The logarithm of the gain is
-    sum over lamps of extinction (log(1 + n_encoding) - log(1 + n_now)), plus what is predicted, bounded together."""
+    """Let n be the number of movable particles between a particle and a light. The log gain is the sum over lights of
+    extinction * (log(1 + n_encoding) - log(1 + n_now)) plus the predicted log gain, bounded by ``max_gain``."""
 
     def __init__(self, config: DirectionalLightConfig):
         super().__init__(config)
@@ -159,18 +155,18 @@ class OcclusionLight(_Light):
     def log_gain(self, occlusion: Tensor) -> Tensor:
         n = len(self.directions)
         before, now = occlusion[:, :n], occlusion[:, -n:]
-        return ((before - now)[:, :, None] * self.extinction).sum(1)  # a product of matrices would be rounded
+        return ((before - now)[:, :, None] * self.extinction).sum(1)  # no matmul: TF32 would round it
 
     def _gain(self, ctx: StepContext, log_gain: Tensor, predicted: Tensor | None) -> Tensor:
         most = self.config.max_gain
         if predicted is not None:
             log_gain = bounded((predicted + log_gain) / most, most)
-        return _held(ctx.share("irradiance_gain"), ctx.state.irradiance_gain, log_gain.exp())
+        return hold(ctx.share("irradiance_gain"), ctx.state.irradiance_gain, log_gain.exp())
 
 
 class LambertianLight(_Light):
-    """Lambert's law with shadows: let E = 1 + sum over lamps of strength v (n.l), with visibility v and normal n of the
-    surface that a particle is part of. The gain is E_now / E_encoding, times the exponential of what is predicted."""
+    """Lambert's law with shadows: E = 1 + sum over lights of strength * v (n.l), with visibility v and normal n of the
+    surface of a particle. The gain is E_now / E_encoding times the exponential of the predicted log gain."""
 
     def __init__(self, config: DirectionalLightConfig):
         super().__init__(config)
@@ -197,26 +193,31 @@ class LambertianLight(_Light):
         most = self.config.max_gain
         if predicted is not None:
             log_gain = log_gain + ctx.share("irradiance_gain") * bounded(predicted / most, most)
-        # Light reaches all, also where other appearance stays.
-        return _held(ctx.share("irradiance_gain", "all"), ctx.state.irradiance_gain, log_gain.exp())
+        # The light changes all particles, also those whose other appearance is frozen.
+        return hold(ctx.share("irradiance_gain", "all"), ctx.state.irradiance_gain, log_gain.exp())
 
 
 def optical_depth(movable: Movable, lights: Tensor, grid_size: float, beam: float) -> Tensor:
-    """[N, L]: log(1 + n) for each particle of the newest clouds and each light, where n counts the movable particles of
-    its scene between them in a Gaussian beam of ``beam`` cells. 0 for sleeping particles. Gradients: of ``lights``."""
+    """log(1 + n) [N, L] for each particle of the newest clouds and each light; 0 for sleeping particles.
+
+    n is the number of movable particles between both in a Gaussian beam of ``beam`` cells.
+
+    Gradients:
+        To ``lights``.
+    """
     with torch.autocast(movable.positions.device.type, enabled=False):
         positions, is_lit, _ = _lit_particles(movable)
         cells = (beam * grid_size, NEAREST * grid_size, EDGE * grid_size)
         samples = movable.samples
         each = (samples.n / samples.known.sum(1).clamp(min=1)).to(positions.dtype)[:, None]
         found = [each * particles_between(positions, samples, light, *cells) for light in lights.unbind(0)]
-        return movable.together(torch.where(is_lit[:, :, None], torch.stack(found, 2).log1p(), 0))
+        return movable.unpad(torch.where(is_lit[:, :, None], torch.stack(found, 2).log1p(), 0))
 
 
 @torch.no_grad()
 def _lit_particles(movable: Movable) -> tuple[Tensor, Tensor, Tensor]:
-    """Positions [B, M, 3] of movable and frozen particles from ``movable.center``, bool [B, M], which they are, and
-    which of them are frozen."""
+    """Positions [B, M, 3] of movable and frozen particles relative to ``movable.center``, the mask [B, M] of both, and
+    the mask [B, M] of frozen ones."""
     moving, frozen = movable.subset, movable.subset.other(FROZEN)
     positions = torch.where(moving.known[:, :, None], moving.positions, frozen.positions) - movable.center
     return positions, moving.known | frozen.known, frozen.known
@@ -225,11 +226,17 @@ def _lit_particles(movable: Movable) -> tuple[Tensor, Tensor, Tensor]:
 def particles_between(
     positions: Tensor, samples: Samples, light: Tensor, beam: float, nearest: float, edge: float
 ) -> Tensor:
-    """[B, M], how many samples are between each of ``positions`` [B, M, 3] and the light, in a Gaussian beam, from
-    ``nearest`` on, where they begin to count over ``edge``; metres.
+    """Number of samples [B, M] between each position and the light.
 
+    Args:
+        positions: [B, M, 3] in metres.
+        samples: particles that cast shadows.
+        light: direction [3] towards the light, of any norm.
+        beam: standard deviation of the Gaussian beam in metres.
+        nearest: distance in metres at which samples count half.
+        edge: width in metres of the sigmoid around it.
     Gradients:
-        of ``light``; a sample near a beam enters it when the light turns.
+        To ``light``.
     """
     direction, targets = light / light.norm(), positions
     positions, there, known = in_blocks(targets, samples.positions, samples.known)
@@ -241,7 +248,7 @@ def particles_between(
         counted.masked_fill_(~known[:, None], 0)
         if not direction.requires_grad:
             return from_blocks(counted.sum(2), targets)
-        # By the direction, the squared way off changes by -2 ahead * way, and the way ahead by the way.
+        # d off / d direction = -2 ahead * offset; d ahead / d direction = offset.
         by_way = counted * (ahead / beam**2 + (1 - begun) / edge)
         slope = by_way @ there - by_way.sum(2, keepdim=True) * positions
         found = counted.sum(2)
@@ -251,22 +258,21 @@ def particles_between(
 def lambert(
     movable: Movable, lights: Tensor, grid_size: float, config: DirectionalLightConfig, facing: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """The irradiance v (n.l) and the cosine n.l of each particle of the newest clouds under each light.
+    """Irradiance v (n.l) and cosine n.l of each particle of the newest clouds under each light.
 
-    A particle is part of the plane through its opaque neighbours among the movable or among the frozen ones; the
-    outside is where there are fewer of them. A ray loses half of its light where it meets the particles of
-    ``EDGE_LAYERS`` movable surfaces, and almost all at two.
+    The normal is that of a plane fit to opaque neighbours, movable or frozen as the particle, and points to the side
+    with fewer of them. A ray through ``EDGE_LAYERS`` movable surfaces loses half of its light.
 
     Args:
-        movable: of the newest clouds.
-        lights: [L, 3], directions of any length.
-        grid_size: metres, edge of a cell.
-        config: of the prior.
-        facing: [N, L], n.l of frozen particles; None: it is computed.
+        movable: movable particles of the newest clouds.
+        lights: directions [L, 3] of any norm.
+        grid_size: edge of a cell in metres.
+        config: configuration of the prior.
+        facing: n.l [N, L] of frozen particles; None: computed here.
     Returns:
-        Both [N, L], 0 to 1; 0 for sleeping particles.
+        Irradiance and cosine, [N, L] each, in [0, 1]; 0 for sleeping particles.
     Gradients:
-        of ``lights``.
+        To ``lights``.
     """
     with torch.autocast(movable.positions.device.type, enabled=False):
         positions, is_lit, is_frozen = _lit_particles(movable)
@@ -281,7 +287,7 @@ def lambert(
         cosines, lit = [], []
         for i, light in enumerate(lights.unbind(0)):
             direction = light / light.norm()
-            of_static = movable.apart(facing)[:, :, i] if static is None else static.cosine(direction, grid_size)
+            of_static = movable.pad(facing)[:, :, i] if static is None else static.cosine(direction, grid_size)
             cosine = torch.where(moving[:, :, 0], surface.cosine(direction, grid_size), of_static)
             with torch.no_grad():
                 start = positions + START * grid_size * torch.where(moving, surface.normals(direction, grid_size), 0)
@@ -290,11 +296,11 @@ def lambert(
             cosines.append(cosine)
             lit.append(cosine * (-math.log(2) * (layers / EDGE_LAYERS).square()).exp())
         found = (torch.where(is_lit, torch.stack(values, 2), 0) for values in (lit, cosines))
-        return tuple(movable.together(values) for values in found)
+        return tuple(movable.unpad(values) for values in found)
 
 
 class _Surface:
-    """The planes through the samples near those of ``positions`` [B, M, 3] that ``compact`` keeps."""
+    """Plane fits to ``samples`` around those of ``positions`` [B, M, 3] that ``compact`` retains."""
 
     def __init__(self, positions: Tensor, compact: Compact, samples: Samples, grid_size: float):
         flat, body, kept = FLAT * grid_size, BODY * grid_size, compact.take(positions)
@@ -310,19 +316,19 @@ class _Surface:
         self._normal, self._out = compact.put(normal), compact.put(out)[:, :, 0]
 
     def normals(self, direction: Tensor, grid_size: float) -> Tensor:
-        """[B, M, 3], towards the outside, or the light ``direction`` where that is not clear."""
+        """Normals [B, M, 3] towards the outside, or towards the light if the outside is ambiguous."""
         out = self._out + TOWARDS * grid_size * (self._normal @ direction)
         return torch.where((out < 0)[:, :, None], -self._normal, self._normal)
 
     def cosine(self, direction: Tensor, grid_size: float) -> Tensor:
-        """[B, M], n.l, 0 where the surface is turned away."""
+        """Softened cosine n.l [B, M], 0 for surfaces that face away."""
         with torch.no_grad():
             normals = self.normals(direction, grid_size)
         return ((normals @ direction + SOFT) / (1 + SOFT)).clamp(min=0)
 
 
 def _one_layer(samples: Samples, beam: float) -> Tensor:
-    """[B, 1], what :func:`particles_between` counts where a ray meets one surface: samples near a sample."""
+    """Number of samples [B, 1] that :func:`particles_between` counts for one surface: mean count around a sample."""
     near = gaussian(squared_distances(samples.positions, samples.positions), beam)
     both = samples.known[:, :, None] & samples.known[:, None]
     return (torch.where(both, near, 0).sum((1, 2)) / samples.known.sum(1).clamp(min=1)).clamp(min=1)[:, None]

@@ -18,20 +18,22 @@ from gsim3d.priors.padding import (
 )
 from gsim3d.state import FROZEN, Particles, constant, newest_clouds
 
-NODES = 6  # of the grid that spans the movable particles of a scene, along each axis
-EVEN = 0.15  # of a window's radius: that of windows in which samples are counted
-APART = 0.2  # of a window's radius: less than half as far as the centers of two bodies are apart
+NODES = 6  # nodes along each axis of the control grid over the movable particles of a scene
+EVEN = 0.15  # radius for the density of samples, over the radius of the window
+APART = 0.2  # radius of windows between body centers over the radius: under half the distance of two centers
 
 
 class Movable:
-    """Movable particles and samples of them. No gradients. At least one newest cloud has particles.
+    """Movable particles of the newest clouds and a subsample of them, without gradients.
+
+    At least one cloud must have particles.
 
     Attributes:
-        subset: [B, M] of the newest clouds.
-        particles: [B, m], compacted.
-        samples: [B, S] of those.
-        center: [B, 1, 3] metres from the origins, the mean of the samples, which they and ``positions`` count from.
-        positions: [B, m, 3].
+        subset: padded movable particles [B, M].
+        particles: compacted movable particles [B, m].
+        samples: subsample [B, S].
+        center: mean of the samples [B, 1, 3], in metres from the origins of the scenes.
+        positions: positions [B, m, 3] in metres relative to ``center``, as those of ``samples``.
     """
 
     def __init__(self, history: Particles, grid_size: float, most: int | None = None):
@@ -49,42 +51,42 @@ class Movable:
             self.positions = self.particles.positions - self.center
 
     def samples_of(self, activity: int, opacity: float = 0.0, *, centered: bool = True) -> Samples:
-        """Samples of another subset; ``centered``: their positions count from ``center``, else from the origins."""
+        """Samples of another subset. Positions are relative to ``center`` if ``centered``, else to the origins."""
         samples = Samples(self.subset.other(activity, opacity))
         if centered:
             samples.center(self.center)
         return samples
 
     def awake(self) -> Tensor:
-        """bool [N], packed: particles that are neither asleep nor outside of the workspace."""
-        return self.together(self.subset.known | self.subset.other(FROZEN).known)
+        """bool [N]: particles inside the workspace that are not asleep."""
+        return self.unpad(self.subset.known | self.subset.other(FROZEN).known)
 
-    def padded(self, values: Tensor) -> Tensor:
-        """[B, m, C] of ``values`` [N, C] of the newest clouds, packed."""
-        return self.compact.take(self.apart(values))
+    def gather(self, values: Tensor) -> Tensor:
+        """Values of the movable particles: packed [N, C] -> compacted [B, m, C]."""
+        return self.compact.take(self.pad(values))
 
-    def packed(self, values: Tensor) -> Tensor:
-        """[N, ...] of ``values`` [B, m, ...]; 0 for particles that cannot move."""
-        return self.together(self.compact.put(values))
+    def scatter(self, values: Tensor) -> Tensor:
+        """Inverse of :meth:`gather`: [B, m, ...] -> [N, ...], 0 for particles that cannot move."""
+        return self.unpad(self.compact.put(values))
 
-    def apart(self, values: Tensor) -> Tensor:
-        """[B, M, C] of ``values`` [N, C] of the newest clouds, packed."""
+    def pad(self, values: Tensor) -> Tensor:
+        """Packed [N, C] -> padded [B, M, C]."""
         most = self.subset.rows.shape[1]
         return torch.stack([F.pad(part, (0, 0, 0, most - len(part))) for part in values.split(self._counts)])
 
-    def together(self, values: Tensor) -> Tensor:
-        """[N, ...] of ``values`` [B, M, ...]."""
+    def unpad(self, values: Tensor) -> Tensor:
+        """Padded [B, M, ...] -> packed [N, ...]."""
         return torch.cat([values[b, :n] for b, n in enumerate(self._counts)])
 
 
 class Windows:
-    """Gaussian windows at the nodes of a control grid, interpolated to movable particles.
+    """Gaussian windows at the nodes of a control grid, interpolated to the movable particles.
 
-    Segmented particles belong to the window of their body and no other: the grid then spans the places of bodies.
+    With segmentation, the grid spans the centers of bodies, so that each body has a window of its own.
 
     Attributes:
-        nodes: [B, G, 3].
-        weights: [B, G, S], how much each sample counts; rows sum to 1.
+        nodes: positions [B, G, 3].
+        weights: weights [B, G, S] of the samples; each row sums to 1.
     """
 
     def __init__(self, movable: Movable, history: Particles, radius: float, *, evenly: bool):
@@ -103,29 +105,33 @@ class Windows:
             self.weights = weights(logits, samples.known)
 
     def to_particles(self, *values: Tensor) -> tuple[Tensor, ...]:
-        """[B, m, 3] at the movable particles, for each of ``values`` [B, G, 3] at the nodes."""
+        """Interpolates each of ``values`` [B, G, 3] to the movable particles, [B, m, 3]."""
         return self._grid.interpolate(self._at, *values)
 
     def to_samples(self, *values: Tensor) -> tuple[Tensor, ...]:
-        """[B, S, 3] at the samples, as :meth:`to_particles`."""
+        """Interpolates each of ``values`` [B, G, 3] to the samples, [B, S, 3]."""
         return self._grid.interpolate(self._sampled, *values)
 
     def mean(self, values: Tensor) -> Tensor:
-        """[N, 1], the mean of ``values`` [N, 1] in the window around each movable particle."""
-        sampled = self.movable.samples.take(self.movable.padded(values.expand(-1, 3)))
+        """Mean [N, 1] of ``values`` [N, 1] in the window of each movable particle."""
+        sampled = self.movable.samples.take(self.movable.gather(values.expand(-1, 3)))
         (found,) = self.to_particles(self.weights @ sampled)
-        return self.movable.packed(found)[:, :1]
+        return self.movable.scatter(found)[:, :1]
 
 
 def _from_center(movable: Movable, history: Particles, positions: Tensor) -> Tensor:
-    """[B, m, 3] of ``positions`` [N, 3] of all particles."""
+    """Positions [B, m, 3] of the movable particles relative to the center, from packed ``positions``."""
     rows = movable.particles.rows
     found = positions.detach()[rows].double() - history.origin[movable.scenes][:, None]
     return torch.where(movable.particles.known[:, :, None], found, 0).to(movable.center.dtype) - movable.center
 
 
 class ControlGrid:
-    """A regular grid that spans positions [B, S, 3], those that are ``known`` [B, S]; ``nodes`` [B, G, 3]."""
+    """A regular grid over the bounding box of the positions [B, S, 3] in the mask ``known`` [B, S].
+
+    Attributes:
+        nodes: positions [B, G, 3].
+    """
 
     def __init__(self, positions: Tensor, known: Tensor):
         known = known[:, :, None]
@@ -137,9 +143,9 @@ class ControlGrid:
         self.nodes = self._low + unit * self._size
 
     def interpolate(self, positions: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
-        """[B, N, 3] at ``positions`` [B, N, 3], trilinear, for each of ``values`` [B, G, 3].
+        """Trilinear interpolation of each of ``values`` [B, G, 3] at ``positions`` [B, N, 3].
 
-        A product with the share of every node: on a GPU its gradient has a fixed order, that of grid_sample has not.
+        Uses a matrix product, whose gradient is deterministic on a GPU; that of grid_sample is not.
         """
         at = ((positions - self._low) / self._size.clamp(min=1e-6)).clamp(0, 1)
         at, field = in_blocks(at, torch.cat(values, 2))

@@ -1,6 +1,6 @@
-"""Particles of one cloud of every scene as padded batches whose sizes are known without waiting for the device.
+"""Padded batches of one cloud a scene, with sizes that are known without a device sync.
 
-Letters: B scenes, M padded particles, m compacted ones, S samples, G nodes.
+Shapes: B scenes, M padded particles, m compacted particles, S samples, G nodes.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from torch.nn import functional as F
 from gsim3d.ops.validate_state import CELLS
 from gsim3d.state import DYNAMIC, Particles, constant
 
-SAMPLES = 1024  # of a subset, evenly spread over its list
-LEAST_LOGIT = -60.0  # of a weight: a CPU takes many times as long for numbers that are almost 0
+SAMPLES = 1024  # largest number of samples of a subset
+LEAST_LOGIT = -60.0  # smallest logit of a weight; avoids denormals, which are slow on a CPU
 
 
 class PaddedClouds:
@@ -24,8 +24,8 @@ class PaddedClouds:
 
     Attributes:
         rows: int64 [B, M], indices of particles.
-        positions: float64 [B, M, 3] metres from the origins of the scenes.
-        is_inside: bool [B, M], particles within the workspace; False for padding.
+        positions: float64 [B, M, 3], metres from the origins of the scenes.
+        is_inside: bool [B, M], particles inside the workspace; False for padding.
     """
 
     def __init__(self, history: Particles, chosen: list[int], grid_size: float):
@@ -42,12 +42,12 @@ class PaddedClouds:
 
 
 class Subset:
-    """Particles of padded clouds with one activity.
+    """Particles of padded clouds with a given activity and a minimum opacity.
 
     Attributes:
         rows: int64 [B, M], indices of particles.
-        known: bool [B, M], members; at least as opaque as ``opacity``.
-        positions: [B, M, 3] metres from the origins of the scenes, 0 for others.
+        known: bool [B, M], mask of the members.
+        positions: [B, M, 3], metres from the origins of the scenes; 0 outside the mask.
     """
 
     def __init__(self, clouds: PaddedClouds, history: Particles, activity: int = DYNAMIC, opacity: float = 0.0):
@@ -58,7 +58,7 @@ class Subset:
         self.positions = torch.where(self.known[:, :, None], clouds.positions, 0).to(history.means.dtype)
 
     def compacted(self, compact: Compact) -> Subset:
-        """[B, m] members that ``compact`` keeps."""
+        """The members in ``compact``, [B, m]."""
         if compact.known is self.known:
             return self
         some = copy.copy(self)
@@ -73,10 +73,10 @@ class Subset:
 class Compact:
     """Stable compaction of a padded batch [B, M] -> [B, m] by a mask.
 
-    m is ``max_count``, or the exact maximum on a CPU; on a GPU without ``max_count`` m = M, which waits for nothing.
+    m is ``max_count``, or the exact maximum on a CPU. On a GPU without ``max_count``, m = M (no device sync).
 
     Attributes:
-        known: bool [B, m].
+        known: bool [B, m], False for padding.
     """
 
     def __init__(self, mask: Tensor, max_count: int | None = None):
@@ -90,31 +90,31 @@ class Compact:
             self._rank = (until - 1).clamp(0, max(1, max_count) - 1)
 
     def take(self, values: Tensor) -> Tensor:
-        """[B, m, ...] of ``values`` [B, M, ...]; 0 for padding."""
+        """Gathers [B, M, ...] -> [B, m, ...], 0 for padding."""
         if self._at is None:
             return values
         return _take_flat(values, self._at, self.known, self._rank, self._mask)
 
     def put(self, values: Tensor) -> Tensor:
-        """[B, M, ...] of ``values`` [B, m, ...]; 0 outside of the mask."""
+        """Scatters [B, m, ...] -> [B, M, ...], 0 outside the mask."""
         if self._at is None:
             return torch.where(self._mask.reshape(*self._mask.shape, *(1,) * (values.dim() - 2)), values, 0)
         return _take_flat(values, self._rank, self._mask, self._at, self.known)
 
 
 def _take_flat(values: Tensor, *indices: Tensor) -> Tensor:
-    """_Take, of ``values`` [B, M, ...]."""
+    """:class:`_Take` for ``values`` [B, M, ...]."""
     return _Take.apply(values.reshape(*values.shape[:2], -1), *indices).reshape(len(values), -1, *values.shape[2:])
 
 
 class Samples:
-    """All members of a subset, or ``SAMPLES`` of them, evenly spread over their list.
+    """All members of a subset or, of larger subsets, ``SAMPLES`` of them at even intervals.
 
     Attributes:
-        n: int64 [B], members.
-        known: bool [B, S], entries that are samples; others are 0.
-        positions: [B, S, 3] metres.
-        mean: [B, 3], of the positions.
+        n: int64 [B], number of members.
+        known: bool [B, S], False for padding.
+        positions: [B, S, 3] in metres, 0 for padding.
+        mean: mean position [B, 3].
     """
 
     def __init__(self, subset: Subset):
@@ -129,35 +129,37 @@ class Samples:
         self.mean = self.mean_of(self.positions)
 
     def _rank(self, k: Tensor) -> Tensor:
-        """Of sample ``k`` in the list of members."""
+        """Rank of sample ``k`` among the members."""
         n = self.n[:, None]
         return torch.where(n > SAMPLES, k * n // SAMPLES, k)
 
     def take(self, values: Tensor) -> Tensor:
-        """[B, S, C] of ``values`` [B, M, C] of the subset; 0 for padding."""
+        """Gathers values of the subset at the samples: [B, M, C] -> [B, S, C], 0 for padding."""
         rank, n = self._until - 1, self.n[:, None]
         k = torch.where(n > SAMPLES, (rank * SAMPLES + n - 1) // n.clamp(min=1), rank).clamp(0, SAMPLES - 1)
         is_sample = self._mask & (self._rank(k) == rank)
         return _Take.apply(values, self._at, self.known, k, is_sample)
 
     def center(self, center: Tensor) -> None:
-        """Counts positions from ``center`` [B, 1, 3]: squares of large coordinates would be all rounding."""
+        """Subtracts ``center`` [B, 1, 3] from the positions, since squares of large coordinates lose precision."""
         self.positions = torch.where(self.known[:, :, None], self.positions - center, 0)
         self.mean = self.mean - center[:, 0]
 
     def mean_of(self, values: Tensor) -> Tensor:
-        """[B, C], the mean of ``values`` [B, S, C]."""
+        """Mean [B, C] of ``values`` [B, S, C]."""
         return torch.where(self.known[:, :, None], values, 0).sum(1) / self.n.clamp(1, SAMPLES)[:, None]
 
     def density(self, radius: float) -> Tensor:
-        """[B, S], samples in a Gaussian window of ``radius`` metres around each, itself one of them."""
+        """Number of samples [B, S] in a Gaussian window of ``radius`` metres around each sample, including itself."""
         near = gaussian(squared_distances(self.positions, self.positions), radius)
         return (near * self.known[:, None]).sum(2).clamp(min=1)
 
 
 class _Take(torch.autograd.Function):
-    """Entries ``at``, each taken once: entry i as number k[i], where ``is_taken``. So its gradient is taken, too; that
-    of gather waits for the device where it has to be deterministic."""
+    """A gather without repeated indices, whose gradient is a gather too: entry i goes to k[i] where ``is_taken``.
+
+    The deterministic gradient of ``torch.gather`` needs a device sync.
+    """
 
     @staticmethod
     def forward(ctx, values: Tensor, at: Tensor, known: Tensor, k: Tensor, is_taken: Tensor) -> Tensor:
@@ -173,7 +175,7 @@ class _Take(torch.autograd.Function):
 
 
 def weights(logits: Tensor, known: Tensor) -> Tensor:
-    """[B, G, S], the softmax of ``logits`` [B, G, S] over the ``known`` [B, S]; 0 where there are none."""
+    """Softmax of ``logits`` [B, G, S] over the mask ``known`` [B, S]; 0 for an empty mask."""
     known = known[:, None]
     logits = torch.where(known, logits, -torch.inf)
     logits = (logits - logits.amax(2, keepdim=True)).clamp(min=LEAST_LOGIT)
@@ -181,13 +183,16 @@ def weights(logits: Tensor, known: Tensor) -> Tensor:
 
 
 def gaussian(squared: Tensor, radius: float) -> Tensor:
-    """exp(-d^2 / 2 radius^2) of squared distances."""
+    """exp(-d^2 / (2 radius^2)) of squared distances d^2."""
     return (squared * (-0.5 / radius**2)).clamp(min=LEAST_LOGIT).exp()
 
 
 def in_blocks(values: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
-    """``values`` [B, N, C] in blocks of one size, [B K, SAMPLES, C], and for each block its part of ``others``
-    [B, ...]: bits of matrix products then do not depend on the sizes of other scenes. Back: :func:`from_blocks`."""
+    """Splits ``values`` [B, N, C] into blocks [B K, SAMPLES, C], and repeats ``others`` [B, ...] for each block.
+
+    With blocks of a fixed size, the bits of matrix products do not depend on the sizes of other scenes. Inverse:
+    :func:`from_blocks`.
+    """
     k = -(-values.shape[1] // SAMPLES)
     values = F.pad(values, (0, 0, 0, k * SAMPLES - values.shape[1])).unflatten(1, (k, SAMPLES))
     others = (x[:, None].expand(-1, k, *x.shape[1:]) for x in others)
@@ -195,11 +200,11 @@ def in_blocks(values: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
 
 
 def from_blocks(blocks: Tensor, like: Tensor) -> Tensor:
-    """[B, N, ...] of ``blocks`` [B K, SAMPLES, ...], for ``like`` [B, N, C]."""
+    """Joins ``blocks`` [B K, SAMPLES, ...] to [B, N, ...], with B and N of ``like`` [B, N, C]."""
     return blocks.unflatten(0, (len(like), -1)).flatten(1, 2)[:, : like.shape[1]]
 
 
 def squared_distances(a: Tensor, b: Tensor) -> Tensor:
-    """[B, G, S] between [B, G, C] and [B, S, C]."""
+    """Squared distances [B, G, S] between ``a`` [B, G, C] and ``b`` [B, S, C]."""
     found = torch.baddbmm(b.square().sum(2)[:, None], a, b.mT, alpha=-2)
     return found.add_(a.square().sum(2)[:, :, None]).clamp_(min=0)

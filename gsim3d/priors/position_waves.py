@@ -1,4 +1,4 @@
-"""Sines and cosines of positions: attention can then find what is at a given distance, as a body above its shadow."""
+"""Sines and cosines of positions, by which attention finds particles at a given distance."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 from gsim3d.priors.base import Prior, PriorConfig, StepContext
 from gsim3d.state import Particles
 
-MOST_WAVES = 16  # further ones are shorter than rounding
+MOST_WAVES = 16  # shorter waves are below float rounding
 
 
 @dataclass(frozen=True)
@@ -19,8 +19,8 @@ class PositionWavesConfig(PriorConfig):
     """Features of positions relative to the scene's origin.
 
     Attributes:
-        count: of waves along each axis; each is half as long as the one before.
-        longest: metres, wavelength of the first.
+        count: waves along each axis; each wavelength is half the previous one.
+        longest: wavelength of the first wave in metres.
     """
 
     type = "position_waves"
@@ -42,8 +42,12 @@ class PositionWaves(Prior, config=PositionWavesConfig):
 
 
 def position_waves(particles: Particles, count: int, longest: float) -> Tensor:
-    """[N, 6 count], of ``count`` waves from ``longest`` metres down."""
-    positions = particles.means.double() - particles.origin[particles.cloud_scene[particles.row_cloud()]]
-    angles = positions * (2 * math.pi / longest)
+    """Features [N, 6 count] of positions relative to the origin; ``longest`` is the largest wavelength in metres."""
+    angles = relative_positions(particles) * (2 * math.pi / longest)
     angles = torch.stack([2**k * angles for k in range(count)], 1)
     return torch.stack([angles.sin(), angles.cos()], 2).flatten(1).to(particles.means.dtype)
+
+
+def relative_positions(particles: Particles) -> Tensor:
+    """Positions relative to the origins of the scenes in metres, float64 [N, 3]."""
+    return particles.means.double() - particles.origin[particles.cloud_scene[particles.row_cloud()]]

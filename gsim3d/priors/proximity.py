@@ -1,4 +1,4 @@
-"""Proximity: where the static background near each movable particle is."""
+"""Proximity: direction and distance of each movable particle to the static background."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from gsim3d.state import FROZEN
 
 @dataclass(frozen=True)
 class ProximityConfig(PriorConfig):
-    """The frozen particles around each movable one.
+    """Static background near each movable particle.
 
     Attributes:
-        range: metres, more than a particle moves in a step, so that a contact is seen before it happens.
-        window: standard deviation of the window in which frozen particles are averaged, over ``range``.
-        min_opacity: of frozen particles that count. Those at silhouettes, whose depth is not known, have less than 0.1;
-            those that the background leaves in the air where it was hidden less than 0.5.
+        range: length scale of the proximity in metres; larger than a displacement in a step, to anticipate contacts.
+        window: standard deviation of the window that averages frozen particles, over ``range``.
+        min_opacity: smallest opacity of frozen particles that count. Particles of uncertain depth at silhouettes are
+            below 0.1, floating particles in occluded regions below 0.5.
     """
 
     type = "proximity"
@@ -34,8 +34,8 @@ class ProximityConfig(PriorConfig):
 
 
 class Proximity(Prior, config=ProximityConfig):
-    """Features p u and p for each movable particle: u is the way to the background in units of the range, and
-    ``p = exp(-|u|^2 / 2)`` the proximity. No gradients."""
+    """Features p u and p of each movable particle, with the vector u to the background in units of ``range`` and the
+    proximity p = exp(-|u|^2 / 2). No gradients."""
 
     n_features, reads_background = 4, True
 
@@ -43,22 +43,22 @@ class Proximity(Prior, config=ProximityConfig):
         """The background near the movable particles of this step."""
         config = self.config
         make = lambda: ContactGeometry(ctx.movable, config.range, config.window, config.min_opacity)  # noqa: E731
-        return ctx.once("contact geometry", make)
+        return ctx.cached("contact geometry", make)
 
     def features(self, ctx: StepContext) -> Tensor:
-        return ctx.of_all(self.geometry(ctx).features)
+        return ctx.scatter_newest(self.geometry(ctx).features)
 
 
 class ContactGeometry:
-    """The frozen particles near each of ``movable``: up to SAMPLES of a scene, evenly spread.
+    """Static background near each movable particle, from up to SAMPLES frozen particles of its scene. No gradients.
 
-    The way leads to their mean in a Gaussian window around the nearest part: of a plane it is the normal, also for a
-    particle that got behind it. Scenes do not see each other. No gradients.
+    The vector to the background ends at the mean of the frozen particles, weighted by a Gaussian of their distances.
+    At a plane it is normal to the plane, also for particles behind it.
 
     Attributes:
-        range: metres.
-        features: [N, 4], p u and p of :class:`Proximity`; 0 for frozen particles, and where nothing is frozen.
-        proximity: [N, 1], p.
+        range: length scale in metres.
+        features: [N, 4], p u and p of :class:`Proximity`; 0 for frozen particles and in scenes without any.
+        proximity: p [N, 1].
     """
 
     def __init__(self, movable: Movable, range: float, window: float, min_opacity: float):
@@ -74,17 +74,17 @@ class ContactGeometry:
             way = (from_blocks(self._window @ self._around, self._positions) - self._positions) / range
             near = (-0.5 * way.square().sum(2, keepdim=True)).clamp(min=LEAST_LOGIT).exp()
             is_any = (frozen.n > 0)[:, None, None]
-            self.features = movable.packed(torch.where(is_any, torch.cat([near * way, near], 2), 0))
+            self.features = movable.scatter(torch.where(is_any, torch.cat([near * way, near], 2), 0))
         self.proximity = self.features[:, -1:]
 
     def surface(self, centers: Tensor) -> tuple[Tensor, Tensor]:
-        """The plane through the background near each particle.
+        """Local plane of the background near each particle. Normals point to the side of the body's center.
 
         Args:
-            centers: [B, m, 3], of the body of each movable particle, as its positions: bodies are in front of planes.
+            centers: [B, m, 3], center of the body of each movable particle, relative to ``movable.center``.
         Returns:
-            The height [N, 1] of the particle over the plane, metres, and its unit normal [N, 3]; 0 for particles that
-            do not move, and where nothing is frozen.
+            Height over the plane in metres [N, 1] and unit normal [N, 3]; 0 for particles that cannot move and in
+            scenes without frozen particles.
         """
         with torch.no_grad(), torch.autocast(self._positions.device.type, enabled=False):
             found = fit_planes(self._window, self._around, self._window_radius)
@@ -92,5 +92,5 @@ class ContactGeometry:
             ahead = ((centers + self._movable.center - self._center - middle) * normal).sum(2, keepdim=True)
             normal = torch.where(ahead < 0, -normal, normal)
             height = ((self._positions - middle) * normal).sum(2, keepdim=True)
-            found = self._movable.packed(torch.cat([height, normal], 2))
+            found = self._movable.scatter(torch.cat([height, normal], 2))
             return found[:, :1], found[:, 1:]

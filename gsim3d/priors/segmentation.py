@@ -1,4 +1,4 @@
-"""Segmentation: which particles are one body, found once, by the gaps between bodies before they touch."""
+"""Segmentation of particles into bodies, by the gaps between bodies when they are encoded."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gsim3d.priors.movable import Movable
 from gsim3d.priors.padding import SAMPLES, squared_distances
 from gsim3d.state import Particles, with_attribute
 
-HOPS = 16  # in which connected samples find their first; the way that is known doubles
+HOPS = 16  # iterations of connected components; each doubles the length of known paths
 
 
 @dataclass(frozen=True)
@@ -21,9 +21,11 @@ class SegmentationConfig(PriorConfig):
     """Density-based clustering of encoded particles.
 
     Attributes:
-        neighbors: within reach of every second particle, itself one of them.
-        min_share: of the particles of the largest cluster; smaller ones belong to the nearest cluster.
-        neck: share of a cluster's particles that may be within reach of another one without both being one body.
+        neighbors: minimum number of neighbours of a core particle, including itself. The radius is the median distance
+            to the neighbour of that rank.
+        min_share: smallest size of a cluster over that of the largest; smaller ones join the nearest cluster.
+        neck: largest fraction of a cluster's particles that may be within the radius of another cluster; clusters in
+            closer contact are merged.
     """
 
     type = "segmentation"
@@ -35,10 +37,10 @@ class SegmentationConfig(PriorConfig):
 
 
 class Segmentation(Prior, config=SegmentationConfig):
-    """Gives encoded particles their ``body``."""
+    """Assigns encoded particles to bodies: ``body`` is the center of the body of each particle."""
 
     def initialize(self, particles: Particles, ctx: StepContext, frames: Frames | None = None) -> Particles:
-        """As :meth:`begin`: bodies are kept once they are known, also through edits."""
+        """Segments particles without bodies. Known bodies are kept, also by edits."""
         return self.begin(particles, ctx)
 
     def begin(self, particles: Particles, ctx: StepContext) -> Particles:
@@ -47,20 +49,20 @@ class Segmentation(Prior, config=SegmentationConfig):
         here = with_attribute(particles, "body").body
         if ctx.is_empty:
             return replace(particles, body=here)
-        found = segment_bodies(ctx.later(particles).movable, particles, self.config)
-        is_newest = ctx.of_all(torch.ones_like(found[:, :1], dtype=torch.bool))
-        return replace(particles, body=torch.where(is_newest, ctx.of_all(found), here))
+        found = segment_bodies(ctx.with_particles(particles).movable, particles, self.config)
+        is_newest = ctx.scatter_newest(torch.ones_like(found[:, :1], dtype=torch.bool))
+        return replace(particles, body=torch.where(is_newest, ctx.scatter_newest(found), here))
 
 
 @torch.no_grad()
 def segment_bodies(movable: Movable, particles: Particles, config: SegmentationConfig) -> Tensor:
-    """[N, 3] metres, for each particle of the newest clouds the middle of its body; for unmovable ones where they are.
+    """Center of the body of each particle of the newest clouds [N, 3] in metres, without gradients.
 
-    Up to SAMPLES particles of a scene are clustered; the others belong to the nearest. No gradients.
+    Clusters up to SAMPLES particles of a scene; the others join the nearest. A particle that cannot move is a body of
+    its own.
 
     Source:
-        DBSCAN, Ester et al. 1996, with a density that is read off the particles; clusters with more than a neck between
-        them are joined.
+        DBSCAN, Ester et al. 1996, with a radius from the density of the particles, and a merge of clusters in contact.
     """
     with torch.autocast(particles.means.device.type, enabled=False):
         samples = movable.samples
@@ -71,14 +73,14 @@ def segment_bodies(movable: Movable, particles: Particles, config: SegmentationC
         found = middle.gather(1, nearest[:, :, None].expand(-1, -1, 3)).double()
         found = found + movable.center + particles.origin[movable.scenes][:, None]
         found, can_move = (
-            movable.packed(x.to(particles.means.dtype)) for x in (found, torch.ones_like(found[:, :, :1]))
+            movable.scatter(x.to(particles.means.dtype)) for x in (found, torch.ones_like(found[:, :, :1]))
         )
         newest = particles.select_clouds(movable.newest)
         return torch.where(can_move > 0, found, with_attribute(newest, "body").body)
 
 
 def _clusters(positions: Tensor, known: Tensor, config: SegmentationConfig) -> Tensor:
-    """int64 [B, S], a number of the body of each of the samples."""
+    """Index of the body of each sample, int64 [B, S]."""
     far = torch.where(known[:, :, None] & known[:, None], squared_distances(positions, positions), torch.inf)
     reach = far.topk(config.neighbors, dim=2, largest=False).values[:, :, -1]
     half = (known.sum(1, keepdim=True) - 1).clamp(min=0) // 2
@@ -99,12 +101,12 @@ def _clusters(positions: Tensor, known: Tensor, config: SegmentationConfig) -> T
 
 
 def _nearest(far: Tensor, wanted: Tensor) -> Tensor:
-    """int64 [B, M], of ``far`` [B, M, S] the nearest sample among ``wanted`` [B, S]."""
+    """Index of the nearest sample in the mask ``wanted`` [B, S], from squared distances [B, M, S]: int64 [B, M]."""
     return torch.where(wanted[:, None], far, torch.inf).argmin(2)
 
 
 def _connected(near: Tensor) -> Tensor:
-    """int64 [B, S], for each sample the first one that steps between ``near`` [B, S, S] ones lead to."""
+    """Connected components of the adjacency ``near`` [B, S, S]: smallest index in each component, int64 [B, S]."""
     each = torch.arange(SAMPLES, device=near.device)
     first = each.expand(near.shape[:2])
     for _ in range(HOPS):

@@ -1,4 +1,4 @@
-"""Shape matching: bodies go back to their rest shape."""
+"""Shape matching: elastic displacements towards the rest shape."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from gsim3d.state import Particles
 
 @dataclass(frozen=True)
 class ShapeMatchingConfig(PriorConfig):
-    """Displacements towards the shape at the start of a simulation.
+    """Shape matching to the positions at the start of the simulation.
 
     Attributes:
-        radius: metres, standard deviation of the windows that keep their shape; about the radius of a body.
-        stiffness: share of the way back that a particle goes in a step without gains.
-        position_gradients: whether gradients flow from the way back to positions. Without them the stiffness of bodies
-            is learned wrongly over many steps.
+        radius: standard deviation in metres of the windows that keep their shape; about the radius of a body.
+        stiffness: fraction of the residual that a step corrects without gains.
+        position_gradients: whether gradients flow from the residual to positions. Without them, long rollouts learn a
+            wrong stiffness.
     """
 
     type = "shape_matching"
@@ -33,41 +33,38 @@ class ShapeMatchingConfig(PriorConfig):
 
 
 class ShapeMatching(Prior, config=ShapeMatchingConfig):
-    """Let w be the way from a particle to where it would be if the window around it had only moved and turned since the
-    start. The elastic displacement is (stiffness + g) w, with predicted gains g along each axis.
-
-    What pulls an elastic body back is a function of w, and a history of a few steps does not show it.
+    """Let w be the vector from a particle to its goal position: its rest position under the rigid motion of its window
+    since the start. The elastic displacement is (stiffness + g) w, with predicted gains g along each axis.
 
     Source:
-        shape matching, Mueller et al. 2005.
+        Mueller et al. 2005, Meshless Deformations Based on Shape Matching.
     """
 
     attributes = ("rest_positions",)
     n_features, n_gains = 3, 3
 
     def residual(self, ctx: StepContext) -> Tensor:
-        """[N, 3] metres, w; without gradients."""
+        """Residual w [N, 3] in metres, without gradients."""
         make = lambda: shape_residual(ctx.windows(self.config.radius), ctx.history, ctx.state)  # noqa: E731
-        return ctx.once("shape residual", make)
+        return ctx.cached("shape residual", make)
 
     def features(self, ctx: StepContext) -> Tensor:
-        return ctx.of_all(self.residual(ctx)) / ctx.grid_size
+        return ctx.scatter_newest(self.residual(ctx)) / ctx.grid_size
 
     def move(self, motion: Motion, gains: Tensor, ctx: StepContext) -> Motion:
-        way, gain = self.residual(ctx).to(motion.gained.dtype), bounded_gains(gains)[:, 0]
+        residual, gain = self.residual(ctx).to(motion.gained.dtype), bounded_gains(gains)[:, 0]
         if not self.config.position_gradients:
-            return replace(motion, gained=motion.gained + gain * way, elastic=self.config.stiffness * way)
+            return replace(motion, gained=motion.gained + gain * residual, elastic=self.config.stiffness * residual)
         means = ctx.state.means
-        return replace(motion, elastic=(self.config.stiffness + gain) * (way - (means - means.detach())))
+        return replace(motion, elastic=(self.config.stiffness + gain) * (residual - (means - means.detach())))
 
 
 @torch.no_grad()
 def shape_residual(windows: Windows, history: Particles, state: Particles) -> Tensor:
-    """[N, 3] metres, from each movable particle to its place in the rest shape, moved and turned as the window around
-    it; 0 for others."""
+    """Vector [N, 3] in metres from each movable particle to its goal position; 0 for other particles."""
     movable, rest = windows.movable, state.rest_positions
     with torch.autocast(rest.device.type, enabled=False):
-        before = (movable.padded(rest).double() - history.origin[movable.scenes][:, None]).to(rest.dtype)
+        before = (movable.gather(rest).double() - history.origin[movable.scenes][:, None]).to(rest.dtype)
         then, now = movable.samples.take(before), movable.samples
         there = now.mean_of(then)[:, None]
         then, before = torch.where(now.known[:, :, None], then - there, 0), before - there
@@ -76,5 +73,5 @@ def shape_residual(windows: Windows, history: Particles, state: Particles) -> Te
         turns = best_rotation(products.unflatten(2, (3, 3)) - center[:, :, :, None] * began[:, :, None])
         shifts = center - (turns @ began[:, :, :, None])[..., 0]
         *columns, shift = windows.to_particles(*turns.unbind(3), shifts)
-        way = (torch.stack(columns, 3) @ before[:, :, :, None])[..., 0] + shift - movable.positions
-        return movable.packed(way)
+        residual = (torch.stack(columns, 3) @ before[:, :, :, None])[..., 0] + shift - movable.positions
+        return movable.scatter(residual)

@@ -1,4 +1,4 @@
-"""Velocity from images: encoded particles are found again in older images, and the motion between is their velocity."""
+"""Velocity of encoded particles, by photometric alignment of rigid motions with older images."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from gsim3d.priors.padding import PaddedClouds, Samples, Subset, squared_distanc
 from gsim3d.priors.rigid import next_displacement, solve3
 from gsim3d.state import CloudTable, Particles, constant
 
-PASSES = 5  # of the alignment
-SHIFT_PASSES = 3  # in which a window follows its particles from cloud to cloud
-SHOWN = 0.9  # share of a window of pixels that must show movable particles
-STIFF, STILL = 1e-4, 0.3  # against turning, and against leaving the displacement of the means, relative to what is seen
-GREY = 0.02  # added to the sum that a colour is divided by
-LEAST = 1e-8  # of what is seen: where nothing is, nothing is solved
-NEAR = 0.01  # metres, from a camera
+PASSES = 5  # Gauss-Newton iterations of the alignment
+SHIFT_PASSES = 3  # mean-shift iterations that follow a window from cloud to cloud
+SHOWN = 0.9  # smallest fraction of a pixel window that must show movable particles
+STIFF, STILL = 1e-4, 0.3  # damping of rotation and translation, relative to the mean diagonal of the normal equations
+GREY = 0.02  # added to the sum of a colour in its normalisation
+LEAST = 1e-8  # smallest diagonal, for windows without valid pixels
+NEAR = 0.01  # smallest depth in metres
 
 
 @dataclass(frozen=True)
@@ -29,11 +29,11 @@ class VelocityFromImagesConfig(PriorConfig):
     """Photometric alignment of rigid motions.
 
     Attributes:
-        radius: metres, standard deviation of the windows that move as one; about the radius of a body.
-        blur: pixels, standard deviation of the window in which images are smoothed.
-        facing: least cosine between where a surface faces and a camera in which it is looked for.
-        robust: differences of colours, from which on they count as if they were as small.
-        inside: metres: particles are encoded so far below the surface that images show, which turns on a larger circle.
+        radius: standard deviation in metres of the windows that move rigidly; about the radius of a body.
+        blur: standard deviation in pixels of the Gaussian blur of the images.
+        facing: smallest cosine between the surface normal and the direction to a camera that is used.
+        robust: threshold of colour differences in the Huber loss.
+        inside: depth in metres of encoded particles below the visible surface.
     """
 
     type = "velocity_from_images"
@@ -47,13 +47,12 @@ class VelocityFromImagesConfig(PriorConfig):
 
 
 class VelocityFromImages(Prior, config=VelocityFromImagesConfig):
-    """Gives encoded particles their ``velocity``: of the newest cloud the mean displacement a step since the oldest of
-    its history or, in a model with gravity, that of the last step; 0 for others.
+    """Sets ``velocity`` of the newest cloud: the mean displacement a step since the oldest cloud of its history or,
+    with gravity, the displacement in the last step. Other clouds get 0.
 
-    The rigid motion of each window is the one with which its particles have in the oldest images, where they were, the
-    colours that they have in the newest, in all cameras together. Colours are divided by their sum, which does not
-    change as a body turns in white light. Alignment begins with the displacement of the means, and with the spin found
-    in the images of the last step: since the oldest a body may have turned too far to be found again.
+    Estimates the rigid motion of each window that aligns the colours of its particles in the newest and the oldest
+    images, over all cameras. Colours are divided by their sum, which is constant as a body rotates in white light. The
+    alignment starts from the displacement of the means and from the spin estimated over the last step.
 
     Source:
         Lucas and Kanade 1981.
@@ -74,16 +73,16 @@ class VelocityFromImages(Prior, config=VelocityFromImagesConfig):
 def estimate_velocity(
     ctx: StepContext, frames: Frames, config: VelocityFromImagesConfig, fall: Tensor | None = None
 ) -> Tensor:
-    """The velocity of encoded particles. Scenes do not see each other.
+    """Estimates the velocity of encoded particles, each scene on its own.
 
     Args:
-        ctx: of ``frames`` encoded. Views of the newest and the oldest step are compared in the order of their images:
-            best those of the same camera.
-        frames: with ``ctx.n_views`` images of each cloud, one cloud after another; nothing then waits for the device.
-        config: of the prior.
-        fall: [N, 3] metres a step squared, of the newest particles: they are faster at last than on average.
+        ctx: context of the particles encoded from ``frames``. The i-th image of the newest step is compared with the
+            i-th image of the oldest; they should be of the same camera.
+        frames: input images. With ``ctx.n_views`` images for each cloud in order, there is no device sync.
+        config: configuration of the prior.
+        fall: acceleration [N, 3] of the newest particles in m/step^2, which converts a mean to a final velocity.
     Returns:
-        [M, 3] metres a step, of all particles; 0 for those of older clouds, and where there is one step only.
+        Velocity [M, 3] in m/step of all particles; 0 in older clouds, and in scenes with a single step.
     """
     particles, clouds, newest = ctx.history, ctx.history.clouds, ctx.newest
     result = torch.zeros_like(particles.means)
@@ -96,7 +95,7 @@ def estimate_velocity(
         now, images = movable.samples, _images(frames, len(clouds), ctx.n_views)
         seen = _Views(frames, particles, *images, newest, movable.center, config)
         center = windows.weights @ now.positions
-        spin = torch.zeros_like(center)  # a step
+        spin = torch.zeros_like(center)  # rad/step
         for earlier in ([max(f, q - 1) for f, q in zip(first, newest)], first):
             then = Samples(Subset(PaddedClouds(particles, earlier, ctx.grid_size), particles))
             then.center(movable.center)
@@ -110,15 +109,15 @@ def estimate_velocity(
         if fall is not None:
             spans = [clouds.steps[q] - clouds.steps[f] for f, q in zip(first, newest)]
             later = constant(tuple(max(0, span - 1) for span in spans), found.device)
-            found = found + 0.5 * later[:, None, None] * movable.padded(fall)
-        found = movable.packed(found)
+            found = found + 0.5 * later[:, None, None] * movable.gather(fall)
+        found = movable.scatter(found)
     for q, part in zip(newest, found.split([clouds.count(q) for q in newest]), strict=True):
         result[clouds.starts[q] : clouds.starts[q + 1]] = part
     return result
 
 
 def _oldest(clouds: CloudTable, begin: int, newest: int, n_steps: int) -> int:
-    """Of the clouds from ``begin`` to ``newest`` the first that is less than ``n_steps`` steps older than the last."""
+    """First cloud from ``begin`` on that is less than ``n_steps`` steps older than ``newest``."""
     return next(q for q in range(begin, newest + 1) if clouds.steps[newest] - clouds.steps[q] < n_steps)
 
 
@@ -131,7 +130,7 @@ def _align(
     before: _Views,
     config: VelocityFromImagesConfig,
 ) -> tuple[Tensor, Tensor]:
-    """Velocity and spin (rad) [B, G, 3] of each window since an earlier step, beginning with those that are given."""
+    """Refines displacement (m) and spin (rad) of each window since an earlier step, [B, G, 3] each."""
     now, window = windows.movable.samples, windows.weights
     outwards = F.normalize(now.positions - windows.to_samples(center)[0], dim=2)
     positions = now.positions + config.inside * outwards
@@ -157,20 +156,22 @@ def _align(
 
 
 def _solve6(matrices: Tensor, values: Tensor) -> Tensor:
-    """[B, G, 6] of [B, G, 6, 6] and [B, G, 6], turns before ways: the turns are eliminated, so that a graph can capture
-    it."""
+    """Solves damped systems [B, G, 6, 6] for [B, G, 6] (spin, translation), by block elimination of the spin.
+
+    CUDA graphs can capture it.
+    """
     size = matrices.diagonal(dim1=2, dim2=3).mean(2)[..., None, None] + LEAST
     one = torch.eye(3, dtype=matrices.dtype, device=matrices.device)
     turns, mixed, ways = matrices[..., :3, :3], matrices[..., :3, 3:], matrices[..., 3:, 3:]
     turns, ways = turns + STIFF * size * one, ways + STILL * size * one
-    by_way = solve3(turns[..., None, :, :], mixed.mT)  # [B, G, 3, 3], rows: of each way
+    by_way = solve3(turns[..., None, :, :], mixed.mT)  # [B, G, 3, 3]
     by_value = solve3(turns, values[..., :3])
     way = solve3(ways - by_way @ mixed, values[..., 3:] - (mixed.mT @ by_value[..., None])[..., 0])
     return torch.cat([by_value - (by_way.mT @ way[..., None])[..., 0], way], 2)
 
 
 def _images(frames: Frames, n_clouds: int, n_views: int | None) -> tuple[Tensor, Tensor]:
-    """int64 [Q, V], images of each cloud; bool [Q, V], where there is one."""
+    """Images of each cloud, int64 [Q, V], and the mask bool [Q, V] of valid entries."""
     of_images = frames.cameras.image_cloud
     if n_views is not None:
         images = torch.arange(n_clouds * n_views, device=of_images.device).unflatten(0, (n_clouds, n_views))
@@ -182,8 +183,10 @@ def _images(frames: Frames, n_clouds: int, n_views: int | None) -> tuple[Tensor,
 
 
 class _Views:
-    """Images of the clouds ``chosen``, one for each scene: colours of movable particles, divided by their sum and
-    smoothed. Positions count from ``center`` [B, 1, 3], which counts from the origins."""
+    """Normalised, blurred images of movable particles, of one cloud (``chosen``) a scene.
+
+    Positions are relative to ``center`` [B, 1, 3], which is relative to the origins of the scenes.
+    """
 
     def __init__(
         self,
@@ -215,17 +218,17 @@ class _Views:
         self._Ks = cameras.Ks[chosen_images].to(center.dtype)
 
     def faces(self, view: int, positions: Tensor, outwards: Tensor) -> Tensor:
-        """bool [B, S], whether what is at ``positions`` faces the camera."""
+        """bool [B, S]: whether a surface at ``positions`` with normals ``outwards`` faces the camera."""
         towards = F.normalize(self._eyes[:, view, None] - positions, dim=2)
         return (towards * outwards).sum(2) > self._facing
 
     def colours(self, view: int, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """[B, S, 3] at ``positions``, and bool [B, S], where there is one."""
+        """Colours [B, S, 3] at ``positions``, and the mask bool [B, S] of valid ones."""
         values, _ = self._at(view, positions)
         return values[..., :3], values[..., 9] > SHOWN
 
     def slopes(self, view: int, positions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """As :meth:`colours`; and [B, S, 3, 3], how each colour changes by the place."""
+        """As :meth:`colours`, and the Jacobian of the colours by the positions [B, S, 3, 3]."""
         values, at = self._at(view, positions)
         K, depth = self._Ks[:, view], at[..., 2:]
         nothing = torch.zeros_like(depth)
@@ -236,7 +239,7 @@ class _Views:
         return values[..., :3], values[..., 9] > SHOWN, by_pixel @ by_place
 
     def _at(self, view: int, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """Values of the pixels that show ``positions``, and the positions as the camera sees them."""
+        """Bilinear samples of the images at ``positions``, and the positions in camera coordinates."""
         at = positions @ self._rotation[:, view].mT + self._way[:, view, None]
         at = torch.cat([at[..., :2], at[..., 2:].clamp(min=NEAR)], 2)
         pixel = (at @ self._Ks[:, view].mT)[..., :2] / at[..., 2:]
@@ -247,19 +250,19 @@ class _Views:
 
 
 def _smoothed(images: Tensor, blur: float) -> Tensor:
-    """[B, V, C, H, W] in a Gaussian window."""
+    """Gaussian blur of images [B, V, C, H, W]."""
     ticks = (torch.arange(n, device=images.device, dtype=images.dtype) for n in images.shape[3:])
     down, across = (((x[:, None] - x).square() * (-0.5 / blur**2)).softmax(1) for x in ticks)
     return down @ images @ across.T
 
 
 def _slope(images: Tensor, axis: int) -> Tensor:
-    """Differences over two pixels, halved; at the border over one."""
+    """Central differences, one-sided at the border."""
     return torch.gradient(images, dim=axis)[0]
 
 
 def _shift(now: Samples, then: Samples, nodes: Tensor, length: float) -> Tensor:
-    """[B, G, 3], how far the particles in the window around each node have moved."""
+    """Displacement [B, G, 3] of the particles in the window of each node, by mean shift."""
     around = _mean_around(nodes, now, length)
     moved = (now.mean - then.mean)[:, None].expand_as(nodes)
     for _ in range(SHIFT_PASSES):
@@ -272,7 +275,7 @@ def _mean_around(nodes: Tensor, samples: Samples, length: float) -> Tensor:
 
 
 def _per_step(clouds: CloudTable, earlier: list[int], newest: list[int], now: Samples, then: Samples) -> Tensor:
-    """[B, 1, 1], one over the steps between two clouds; 0 where they are one or one has no movable particle."""
+    """1 / steps between two clouds [B, 1, 1]; 0 if they are the same or one has no movable particles."""
     gaps = tuple(clouds.steps[q] - clouds.steps[e] for q, e in zip(newest, earlier, strict=True))
     gaps = constant(gaps, now.n.device)
     known = (gaps > 0) & (now.n > 0) & (then.n > 0)

@@ -321,7 +321,7 @@ class _Step:
 
         def geometry(history: Particles) -> Pyramid:
             pyramid = self._owner.simulator.dynamics.geometry(history)
-            needed.append(PyramidCapacity.of(pyramid, self._owner.simulator.dynamics.room(history), FACTOR))
+            needed.append(PyramidCapacity.of(pyramid, self._owner.simulator.dynamics.capacity(history), FACTOR))
             return pyramid
 
         if self._n_future:

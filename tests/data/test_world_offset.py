@@ -133,7 +133,7 @@ def test_edits_take_world_coordinates(two, simulator):
         )
         torch.testing.assert_close(world(b), world(a) + torch.tensor(PLACES[0]), rtol=0, atol=1e-3)
         assert not torch.equal(a.means, states[0].means) and torch.equal(b.world_offset, states[1].world_offset)
-    with pytest.raises(InputError, match=r"theirs is \[\[49999"):
+    with pytest.raises(InputError, match=r"their bounds are \[\[49999"):
         Move(Selection("all", ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)))).apply(states[1], simulator._colors)
 
 

@@ -26,7 +26,7 @@ def some_asleep(history):
 
 def with_room(dynamics, history, factor=1.25, generator=None):
     exact = dynamics.geometry(history)
-    capacity = PyramidCapacity.of(exact, dynamics.room(history), factor)
+    capacity = PyramidCapacity.of(exact, dynamics.capacity(history), factor)
     return dynamics.geometry(history, capacity=capacity, generator=generator)
 
 
@@ -93,10 +93,10 @@ def test_overflow_is_counted():
 
 def test_unseen_particles_need_no_capacity():
     dynamics, history = make_dynamics(RELIGHTABLE), some_asleep(make_history((400, 300, 200), frozen_share=0.8))
-    assert dynamics.room(history) < 0.6 * history.n_rows
-    assert make_dynamics(MOVING).room(history) == history.n_rows
+    assert dynamics.capacity(history) < 0.6 * history.n_rows
+    assert make_dynamics(MOVING).capacity(history) == history.n_rows
     pyramid = with_room(dynamics, history, 1.0)
-    assert pyramid.rows.shape[0] == dynamics.room(history)
+    assert pyramid.rows.shape[0] == dynamics.capacity(history)
     expected, step = dynamics(history), dynamics(history, pyramid=pyramid)
     for name, value in float_fields(expected).items():
         assert_same_bits(getattr(step, name), value, name)
@@ -106,7 +106,7 @@ def test_too_many_seen_particles_are_counted():
     dynamics, history = make_dynamics(RELIGHTABLE), make_history((40, 30), frozen_share=0.8)
     exact = dynamics.geometry(history)
     n_seen = exact.stages[0].n_rows
-    roomy = PyramidCapacity.of(exact, dynamics.room(history))
+    roomy = PyramidCapacity.of(exact, dynamics.capacity(history))
     small = dataclasses.replace(roomy, sizes=(n_seen - 1, *roomy.sizes[1:]))
     found = dynamics.geometry(history, capacity=small).found.tolist()
     assert found[:2] == [PyramidCapacity.TOO_LARGE, n_seen] and not small.fits(found)

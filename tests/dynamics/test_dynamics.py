@@ -272,7 +272,7 @@ def test_a_long_rollout_stays_finite():
     [
         ({"cloud_step": torch.tensor([0, 9])}, "must span at most 4 steps; got 10"),
         ({"cloud_step": torch.tensor([1, 0])}, "sorted by .scene, step."),
-        ({"static_latents": torch.zeros(25, 7)}, "static_latents must have 3 channels a row"),
+        ({"static_latents": torch.zeros(25, 7)}, "static_latents must have 3 channels"),
     ],
 )
 def test_errors_name_the_argument(change, message):

@@ -120,5 +120,5 @@ def test_gradients_flow_to_how_the_background_began():
 
 
 def test_explicit_models_have_no_such_background():
-    with pytest.raises(ValueError, match='background="relightable" needs a model that is not explicit'):
+    with pytest.raises(ValueError, match='background="relightable" does not support explicit models'):
         dataclasses.replace(EXPLICIT, background="relightable")

@@ -138,7 +138,7 @@ def test_throw_adds_velocity():
     ages = torch.tensor([2, 1, 0, 1, 0])[state.row_cloud()][moving, None]
     assert_close_relative_to_max((state.means - thrown.means)[moving], ages * velocity, 1e-4)
     assert_same_bits(thrown.means[~moving], state.means[~moving])
-    with pytest.raises(InputError, match="edit at step 4, throw: a history of one step holds no velocity"):
+    with pytest.raises(InputError, match="edit at step 4, throw: a history of one step has no velocity"):
         one = EffectsSpec(dynamics=DynamicsEffects(history=1))
         future(simulator, state, 5, [Edit(4, Throw("moving", (1.0, 0.0, 0.0)))], one)
     with pytest.raises(InputError, match="edit at step 0, throw: frozen particles cannot be thrown"):
@@ -177,9 +177,9 @@ def test_insert_merges_scenes():
     assert_same_bits(painted.color_transform[-1], torch.eye(3))
     assert future(simulator, here, 2, [Edit(1, Insert("moving", there))])[-1].n_rows > last_steps(here, 1).n_rows
     other, foreign, _ = encoded(MODELS["explicit"], (1,))
-    with pytest.raises(InputError, match="edit at step 0, insert: particles.quats must be as those of the state"):
+    with pytest.raises(InputError, match="edit at step 0, insert: particles.quats differs in shape"):
         future(simulator, here, 1, [Edit(0, Insert("all", foreign))])
-    with pytest.raises(InputError, match="edit at step 0, insert: particles must be of one scene"):
+    with pytest.raises(InputError, match="edit at step 0, insert: particles must be of a single scene"):
         future(simulator, here, 1, [Edit(0, Insert("all", both))])
 
 
@@ -275,8 +275,8 @@ def test_files(tmp_path):
         ("- {step: 2, op: move, by: [0, 1, .nan]}", r"edit 0 at step 2, move: by\[2\]: must be a number; got nan"),
         ("- {step: 2, op: remove, of: ground}", "edit 0 at step 2, remove: of: which must be one of all, moving"),
         ("- {step: 2, op: move, of: {box: [[0, 0, 0], [1, -1, 1]]}}", "move: of: box must be the lowest and the high"),
-        ("- {step: 2, op: rotate, axis: [0, 0, 0]}", "edit 0 at step 2, rotate: axis must have a direction"),
-        ("- {step: 2, op: recolor, color: [2, 0, 0]}", "edit 0 at step 2, recolor: color must be three numbers from 0"),
+        ("- {step: 2, op: rotate, axis: [0, 0, 0]}", "edit 0 at step 2, rotate: axis must be a nonzero vector"),
+        ("- {step: 2, op: recolor, color: [2, 0, 0]}", "edit 0 at step 2, recolor: color must be three numbers in"),
         ("- {step: 2, op: insert}", "edit 0 at step 2, insert: scene must name a scene folder; got None"),
         ("- {step: 2, op: [", "cannot be read"),
     ],

@@ -45,7 +45,7 @@ def test_plan_command_reads_spec_of_scene(capsys, tmp_path):
     assert re.search(r"^frozen_appearance +switch +selections: 2$", out, re.MULTILINE)
     (scene / "effects.yaml").write_text("dynamics: {history: 9}")
     code, out, err = call(capsys, "plan", scene)
-    assert code == 2 and "unsupported effect dynamics.history: this model goes up to 2; got 9" in err
+    assert code == 2 and "unsupported effect dynamics.history: this model supports at most 2; got 9" in err
 
 
 def test_plan_command_reports_background_cost(capsys, tmp_path):

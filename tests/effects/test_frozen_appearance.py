@@ -200,7 +200,7 @@ def test_frozen_appearance_refuses_empty_selection():
         rolled(case, holding(half(case.state), nowhere))
     start = last_steps(case.state, 1)
     places = start.means[start.activity == 0]
-    corners = str(error.value).split("; theirs is ")[1]
+    corners = str(error.value).split("; their bounds are ")[1]
     assert_close_relative_to_max(torch.tensor(json.loads(corners)), torch.stack([places.amin(0), places.amax(0)]), 0.01)
 
 

@@ -64,8 +64,8 @@ def test_old_key_of_frozen_appearance_is_converted():
         ({"dynamics": {"contact": {"pairs": [["a", "b"]]}}}, "unsupported effect dynamics.contact"),
         ({"dynamics": {"sleep": {"policy": "approx"}}}, "unsupported effect dynamics.sleep.policy approx"),
         ({"dynamics": {"background": "asymmetric"}}, "unsupported effect dynamics.background asymmetric"),
-        ({"outputs": {"rgb": False}}, "unsupported effect outputs: there is no image to make"),
-        ({"dynamics": {"history": 5}}, "unsupported effect dynamics.history: this model goes up to 4; got 5"),
+        ({"outputs": {"rgb": False}}, "unsupported effect outputs: no output is on"),
+        ({"dynamics": {"history": 5}}, "unsupported effect dynamics.history: this model supports at most 4; got 5"),
         ({"appearance": {"opacity_changes": True}}, "unsupported effect appearance.opacity_changes"),
     ],
 )
@@ -75,7 +75,7 @@ def test_plan_refuses_unsupported_effects(values, message):
 
 
 def test_plan_refuses_degree_beyond_model():
-    with pytest.raises(UnsupportedEffect, match="view_dependent: this model goes up to 0; got 2"):
+    with pytest.raises(UnsupportedEffect, match="view_dependent: this model supports at most 0; got 2"):
         make_plan(EffectsSpec(appearance=AppearanceEffects(view_dependent=2)), presets.tiny())
 
 

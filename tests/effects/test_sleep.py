@@ -95,7 +95,7 @@ def test_sleeper_wakes_before_fast_particle_arrives(speed):
         means = before.means.clone()
         means[0, 0] = step * k
         after = dataclasses.replace(before, means=means)
-        sleepers.look(before, after)
+        sleepers.update(before, after)
         before = after
         awake = (~sleepers.asleep).nonzero()[:, 0].tolist()
         assert {0, k, k + 1} <= set(awake)
@@ -201,7 +201,7 @@ def test_sleeping_particles_act_as_background():
     asleep = (newest.activity != FROZEN) & (newest.means[:, 0] < 0.5)
 
     class Some(Sleepers):
-        def look(self, before, after):
+        def update(self, before, after):
             self.n_steps += 1
             self.asleep = asleep & (self.n_steps >= 4)
             return self.n_steps == 4

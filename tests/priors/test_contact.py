@@ -36,7 +36,7 @@ FRICTION, SKIN = torch.tensor(1.0), torch.tensor(0.0)
 def solver(history, radius=WIDE, friction=FRICTION, skin=SKIN, rigid=False):
     ctx = context(history, NEAR, grid_size=CELL)
     if history.body is None:  # one body whose particles count as evenly as those of segmented ones
-        ctx.windows = lambda radius: ctx.once("windows", lambda: windows(history, radius, CELL, evenly=True))
+        ctx.windows = lambda radius: ctx.cached("windows", lambda: windows(history, radius, CELL, evenly=True))
     numbers = (x.to(history.means) for x in (friction, skin))
     config, geometry = ContactConfig(radius=radius, rigid=rigid), ctx.priors.get("proximity").geometry(ctx)
     return ContactSolver(ctx, geometry, config, *numbers)
@@ -122,7 +122,7 @@ def test_segmented_windows_conserve_momentum(which):
     history, first = two_balls()
     chosen = first if which == 0 else (history.activity == DYNAMIC) & ~first
     found = windows(history, 0.3, CELL, evenly=True)
-    share = found.movable.packed(found.weights.amax(1)[:, : found.movable.positions.shape[1], None])[chosen]
+    share = found.movable.scatter(found.weights.amax(1)[:, : found.movable.positions.shape[1], None])[chosen]
     found = moves(history, back=noise(history) + 0.02, radius=0.3)[chosen]
     places = history.means[chosen] - history.means[chosen].mean(0)
     assert share.sum().item() == pytest.approx(1, abs=1e-3) and found.abs().max() > 0.01

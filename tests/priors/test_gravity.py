@@ -152,5 +152,5 @@ def test_gravity_needs_other_priors(name):
 
 
 def test_acceleration_must_be_a_vector():
-    with pytest.raises(InputError, match="acceleration must be three numbers"):
+    with pytest.raises(InputError, match="acceleration must have three components"):
         GravityConfig(acceleration=(1.0,))

@@ -51,16 +51,16 @@ def test_movable_particles_keep_order(device):
             assert_same_bits(movable.particles.rows[b][movable.particles.known[b]], wanted)
         assert_same_bits(movable.samples.positions, exact.samples.positions)
     newest = torch.cat([history.means[40:80], history.means[105:]])
-    padded = exact.padded(newest)
+    padded = exact.gather(newest)
     assert_same_bits(padded, torch.where(exact.particles.known[:, :, None], padded, 0))
     moves = torch.cat([((history.activity == DYNAMIC) & inside)[a:b] for a, b in ((40, 80), (105, 130))])
-    assert_same_bits(exact.packed(padded), torch.where(moves[:, None], newest, 0))
+    assert_same_bits(exact.scatter(padded), torch.where(moves[:, None], newest, 0))
 
 
 def test_packing_gradients():
     movable = Movable(scenes(), TINY.grid_size, 33)
     values = torch.randn(65, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: movable.packed(movable.padded(x) ** 2), values)
+    assert torch.autograd.gradcheck(lambda x: movable.scatter(movable.gather(x) ** 2), values)
 
 
 def test_capacity_of_movable_particles_changes_nothing(device):
