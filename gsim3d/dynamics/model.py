@@ -341,12 +341,8 @@ def _later(particles: Particles, n_steps: int) -> Particles:
 
 
 def _seen_first(seen: Tensor, cu_rows: Tensor, n_rows: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Selects ``n_rows`` particles, seen ones first, without a device sync.
-
-    Returns:
-        Indices int64 [n_rows], offsets of the clouds among them, the mask bool [n_rows] of seen ones, and the total
-        number of seen particles [].
-    """
+    """Selects ``n_rows`` particles, seen ones first, without a device sync. Returns their indices, the offsets of the
+    clouds among them, the mask of seen ones, and the total number of seen particles."""
     until = F.pad(seen.cumsum(0), (1, 0))
     rows = torch.sort((~seen).to(torch.uint8), stable=True).indices[:n_rows]
     starts = until[cu_rows].clamp(max=n_rows)

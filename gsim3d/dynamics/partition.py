@@ -44,7 +44,8 @@ class Partition:
         if asleep is not None:
             rests = rests | _in_every_cloud(history, newest, asleep)
         moving = _awake(history.select_rows(~rests))
-        newest_rests = last_steps(_marked(history, rests), 1).activity > 0
+        marked = history.with_clouds(history.clouds, activity=rests.to(torch.uint8))
+        newest_rests = last_steps(marked, 1).activity > 0
         if asymmetric:
             awake = set(moving.clouds.scenes)
             background = newest.select_rows(newest_rests & (newest.activity != ASLEEP))
@@ -83,7 +84,3 @@ def _in_every_cloud(history: Particles, newest: Particles, asleep: Tensor) -> Te
     table, starts = history.clouds, dict(zip(newest.clouds.scenes, zip(newest.clouds.starts, newest.clouds.starts[1:])))
     marks = [asleep[slice(*starts[scene])] for scene in table.scenes]
     return torch.cat(marks) if marks else asleep
-
-
-def _marked(history: Particles, rows: Tensor) -> Particles:
-    return history.with_clouds(history.clouds, activity=rows.to(torch.uint8))

@@ -162,14 +162,7 @@ class StateLayout:
 
     @staticmethod
     def share(particles: Particles, name: str, which: str, awake: Tensor | None) -> Tensor:
-        """Mask [N, 1] in the dtype of positions: 1 for particles whose attribute ``name`` changes.
-
-        Args:
-            particles: state [N].
-            name: attribute.
-            which: "all", "dynamic", "frozen" or "none".
-            awake: bool [N], particles that may change; None: all.
-        """
+        """Mask [N, 1] in the dtype of positions: 1 for particles whose attribute ``name`` changes for ``which``."""
         frozen = particles.activity == FROZEN
         masks = {"all": torch.ones_like(frozen), "dynamic": ~frozen, "frozen": frozen, "none": torch.zeros_like(frozen)}
         mask = masks[which] if awake is None else masks[which] & awake
@@ -195,12 +188,10 @@ class StateLayout:
     def _differences(self, name: str, newest: Tensor, predicted: Tensor) -> Tensor:
         """Change [S, N, ...] of an attribute from its newest values, for each step."""
         predicted = _unflat(name, predicted)
-        changes = self._target(name, predicted) - newest if self._absolute else self._change(name, predicted)
+        if self.config.predicts == "absolute":
+            return self._target(name, predicted) - newest
+        changes = self._change(name, predicted)
         return changes.cumsum(0) if self.config.predicts == "from_previous" else changes
-
-    @property
-    def _absolute(self) -> bool:
-        return self.config.predicts == "absolute"
 
     def _change(self, name: str, predicted: Tensor) -> Tensor:
         config = self.config
@@ -232,7 +223,7 @@ class StateLayout:
 
     def _later_quats(self, newest: Tensor, predicted: Tensor, share: Tensor) -> Tensor:
         """:meth:`later_values` of quaternions, which are normalised where they change."""
-        if self._absolute:
+        if self.config.predicts == "absolute":
             target = predicted.roll(1, 2)
             return hold(share, newest, unit_quats(newest + share * (target - newest)))
         later, before = [], newest

@@ -77,14 +77,10 @@ def _velocities(windows: Windows, own: Tensor) -> Tensor:
 
 
 def _rigid_motion(windows: Windows, moved: Tensor, since: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """Fits rigid motions to displacements ``moved`` [N, 3] in each window.
+    """Fits a rigid motion to displacements ``moved`` [N, 3] that start, or ``since`` then end, at the positions.
 
-    Args:
-        windows: windows around the movable particles.
-        moved: displacements in metres.
-        since: whether ``moved`` ends at the current positions (else it starts there).
     Returns:
-        Displacement (m), spin (rad) and center (m) of each window at the current positions, [B, G, 3] each.
+        Displacement, spin (rad) and center of each window, [B, G, 3] each.
     """
     samples, half = windows.movable.samples, -0.5 if since else 0.5
     paths = samples.take(windows.movable.gather(moved))

@@ -198,13 +198,8 @@ class LambertianLight(_Light):
 
 
 def optical_depth(movable: Movable, lights: Tensor, grid_size: float, beam: float) -> Tensor:
-    """log(1 + n) [N, L] for each particle of the newest clouds and each light; 0 for sleeping particles.
-
-    n is the number of movable particles between both in a Gaussian beam of ``beam`` cells.
-
-    Gradients:
-        To ``lights``.
-    """
+    """log(1 + n) [N, L] with the number n of movable particles between each particle of the newest clouds and each
+    light, in a Gaussian beam of ``beam`` cells; 0 for sleeping particles. Gradients flow to ``lights`` [L, 3]."""
     with torch.autocast(movable.positions.device.type, enabled=False):
         positions, is_lit, _ = _lit_particles(movable)
         cells = (beam * grid_size, NEAREST * grid_size, EDGE * grid_size)

@@ -127,11 +127,7 @@ def _from_center(movable: Movable, history: Particles, positions: Tensor) -> Ten
 
 
 class ControlGrid:
-    """A regular grid over the bounding box of the positions [B, S, 3] in the mask ``known`` [B, S].
-
-    Attributes:
-        nodes: positions [B, G, 3].
-    """
+    """A regular grid with ``nodes`` [B, G, 3] over the bounding box of ``positions`` [B, S, 3] where ``known``."""
 
     def __init__(self, positions: Tensor, known: Tensor):
         known = known[:, :, None]

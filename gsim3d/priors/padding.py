@@ -157,9 +157,7 @@ class Samples:
 
 class _Take(torch.autograd.Function):
     """A gather without repeated indices, whose gradient is a gather too: entry i goes to k[i] where ``is_taken``.
-
-    The deterministic gradient of ``torch.gather`` needs a device sync.
-    """
+    The deterministic gradient of ``torch.gather`` needs a device sync."""
 
     @staticmethod
     def forward(ctx, values: Tensor, at: Tensor, known: Tensor, k: Tensor, is_taken: Tensor) -> Tensor:

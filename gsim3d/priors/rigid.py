@@ -83,11 +83,9 @@ def best_rotation(products: Tensor) -> Tensor:
 
 
 def largest_eigenspace(matrices: Tensor) -> Tensor:
-    """Projection v v^T [..., n, n] on the eigenvector with the largest eigenvalue, by repeated squaring.
+    """Projection v v^T on the eigenvector v with the largest eigenvalue of positive semidefinite matrices [..., n, n].
 
-    Args:
-        matrices: symmetric positive semidefinite [..., n, n]. For a multiple eigenvalue the result is the mean of the
-            projections, for zeros it is 0.
+    Computed by repeated squaring. A multiple eigenvalue gives the mean of its projections, a zero matrix gives 0.
     """
     for _ in range(2):  # twice, against underflow
         matrices = _of_trace_one(matrices)
