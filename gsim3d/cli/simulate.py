@@ -11,8 +11,8 @@ from gsim3d.pretrained import CHECKPOINT_HELP
 EPILOG = """\
 The scene's first steps are the input; the following ones are predicted, also beyond the end of the video. Written to
 DIR: rollout.mp4 (truth above prediction, a column for each camera; H.264 with gsim3d[video], else VP9), frames/
-(predicted images as PNG) and gaussians/step_0000.ply ... (3D Gaussians of every step, for viewers of 3D Gaussian
-splatting).
+(predicted images as PNG), gaussians/step_0000.ply ... (3D Gaussians of every step, for viewers of 3D Gaussian
+splatting) and state.safetensors (the last steps as particles: gsim3d view DIR --checkpoint CHECKPOINT goes on).
 
 examples:
   gsim3d simulate runs/model runs/data/ball/0000 --out runs/ball

@@ -15,11 +15,13 @@ from torch import Tensor
 
 from gsim3d.cameras import Cameras
 from gsim3d.data import Scene
+from gsim3d.dynamics import last_steps
 from gsim3d.errors import InputError
 from gsim3d.evaluate.protocol import Prediction, render_steps
 from gsim3d.evaluate.scoring import METRICS
 from gsim3d.io import write_ply, write_video
 from gsim3d.io.files import write_picture
+from gsim3d.io.particles import STATE, write_particles
 from gsim3d.io.sequence import write_about
 from gsim3d.io.terminal import progress
 from gsim3d.nn.gaussian_head import render
@@ -99,6 +101,8 @@ def write_prediction(
         rows = {"truth": truth, "predicted": np.stack(images)}
         write_video(part / "rollout.mp4", film_frames(rows, scene.fps, prediction.n_encoded), scene.fps)
         write_gaussians(part / "gaussians", restored, prediction, scene.fps)
+        last = last_steps(prediction.particles, 2**restored.simulator.config.dynamics.history_bits)
+        write_particles(part / STATE, last, restored.checkpoint.digest)
         if player:
             camera = scene.cameras_at(cams[:1], [first])
             write_player(

@@ -5,8 +5,10 @@ import importlib
 _HOME = {
     "FORMATS": "formats",
     "format_of": "formats",
+    "read_particles": "particles",
     "read_ply": "ply",
     "read_splats": "formats",
+    "write_particles": "particles",
     "write_ply": "ply",
     "write_splats": "formats",
     "write_video": "video",

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
 from gsim3d.data import Scene, layouts
-from gsim3d.errors import InputError
+from gsim3d.errors import FitWarning, InputError
+from gsim3d.io.particles import STATE, read_particles
 from gsim3d.io.sequence import GAUSSIANS, Sequence, open_sequence
-from gsim3d.state import Gaussians
+from gsim3d.state import Gaussians, Particles
+from gsim3d.train.restore import Restored
 from gsim3d.viewer.live import Target
 
 FPS = 24.0  # of files that do not say
@@ -37,6 +40,8 @@ def open_target(
         InputError: it is nothing of that kind, or is damaged; the message names it.
     """
     path = Path(target)
+    if path.is_file() and state_of(path):
+        raise InputError(f"{path}: a state is drawn by its simulator: name it with --checkpoint")
     if path.is_dir() and not (path / GAUSSIANS).is_dir() and _is_scene(path):
         if scene is not None or up is not None:
             raise InputError(f"{path} is a recorded scene; --scene and --up belong to files of Gaussians")
@@ -54,6 +59,23 @@ def open_target(
         scene=recorded,
         first=0 if recorded is None else _checked(recorded, start),
     )
+
+
+def state_of(target: str | Path) -> Path | None:
+    """The file of the state that ``target`` is, or that lies in this run; None: there is none."""
+    path = Path(target)
+    file = path / STATE if path.is_dir() else path
+    return file if file.suffix == Path(STATE).suffix and file.is_file() else None
+
+
+def open_state(path: Path, restored: Restored) -> Particles:
+    """The particles of a state. Raises InputError where they are not those of a model like ``restored``."""
+    particles, model = read_particles(path)
+    restored.simulator._check(particles, str(path))
+    if model != restored.checkpoint.digest:
+        said = f"{path}: written with another checkpoint, whose particles may mean something else"
+        warnings.warn(said, FitWarning, stacklevel=2)
+    return particles
 
 
 @dataclass(frozen=True)

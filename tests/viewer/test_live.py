@@ -11,16 +11,13 @@ import numpy as np
 import pytest
 import torch
 
-from gsim3d.cameras import InputSpec
 from gsim3d.cli.main import main
-from gsim3d.effects.edits import Move, Remove
-from gsim3d.effects.spec import DynamicsEffects, EffectsSpec
+from gsim3d.effects.edits import Move
 from gsim3d.errors import InputError
 from gsim3d.io import read_splats, write_ply
 from gsim3d.io.sequence import write_about
 from gsim3d.math.spherical_harmonics import SH_0
 from gsim3d.state import ASLEEP, DYNAMIC, FROZEN, Gaussians
-from gsim3d.train.restore import restore
 from gsim3d.viewer import server
 from gsim3d.viewer.live import (
     ASLEEP_COLOR,
@@ -32,10 +29,9 @@ from gsim3d.viewer.live import (
     splatting_of,
     unit_of,
 )
-from gsim3d.viewer.simulation import Simulation
 from gsim3d.viewer.targets import open_target
-from tests.test_simulator import SIZE, make_simulator
-from tests.tiny_scenes import N_CAMS, write_scene
+from tests.test_simulator import SIZE
+from tests.tiny_scenes import N_CAMS
 from tests.viewer.browser import Browser, chromium
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -56,29 +52,6 @@ def falling(n_frames=4):
 
 def target_of(frames, **options) -> Target:
     return Target("falling", 10.0, frames=frames, **options)
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
-    return write_scene(tmp_path_factory.mktemp("data") / "ball" / "0000", size=SIZE)
-
-
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory):
-    simulator = make_simulator()
-    simulator.inputs = InputSpec(history=2, context_views=2, image_size=(SIZE, SIZE), fps=12.0)
-    simulator.effects = EffectsSpec(dynamics=DynamicsEffects(history=2))
-    return simulator.save_pretrained(tmp_path_factory.mktemp("model") / "model")
-
-
-@pytest.fixture
-def simulation(checkpoint, scene) -> Simulation:
-    return simulated(checkpoint, scene, 3)
-
-
-def simulated(checkpoint, scene, n_steps) -> Simulation:
-    restored = restore(checkpoint)
-    return Simulation(restored, restored.open_scene(scene), n_steps)
 
 
 def test_timeline_advances_at_its_speed_and_loops():
@@ -255,39 +228,6 @@ def test_activity_colors_and_layers_follow_the_particles(simulation):
     assert len(target.seen(0, Layers(moving=False, frozen=False)).means) == 0
 
 
-def test_simulate_on_equals_one_rollout_with_all_edits(simulation, checkpoint, scene):
-    first = simulation.target.particles[2].means
-    simulation.simulate_on(2, 2, [Move("all", (0.0, 0.0, 0.5))])
-    simulation.simulate_on(3, 2, [Move("all", (0.0, 0.2, 0.0))])
-    target = simulation.target
-    assert target.n_frames == 6 and [edit.step for edit in simulation.edits] == [1, 2]
-    assert torch.equal(target.particles[2].means, first)
-    assert (target.particles[3].means - first)[:, 2].mean() > 0.3
-    again = simulated(checkpoint, scene, 1)
-    state, plan = again._state, again._simulator.plan(again.effects)
-    with torch.no_grad():
-        steps = again._simulator.rollout(state, 4, plan, edits=simulation.edits)
-    assert torch.equal(target.particles[-1].means, steps[-1].means)
-    simulation.simulate_on(1, 1)
-    assert simulation.edits == () and target.n_frames == 3
-
-
-def test_simulate_on_removes_inside_of_a_box_and_refuses_without_a_change(simulation):
-    target, before = simulation.target, list(simulation.target.particles)
-    with pytest.raises(InputError, match="edit at step 2, remove: the selection is empty"):
-        simulation.simulate_on(3, 1, [simulation.operation("remove", "all", (0, 0, 0), ([90] * 3, [91] * 3))])
-    with pytest.raises(InputError, match="frame 0 must be from 1 to 4"):
-        simulation.simulate_on(0, 1)
-    with pytest.raises(InputError, match="operation must be one of"):
-        simulation.operation("explode", "all", (0, 0, 0))
-    assert all(a is b for a, b in zip(target.particles, before, strict=True)) and simulation.edits == ()
-    middle = target.particles[3].means.median(0).values.tolist()
-    box = [x - 0.3 for x in middle], [x + 0.3 for x in middle]
-    simulation.simulate_on(3, 1, [simulation.operation("remove", "all", (0, 0, 0), box)])
-    assert isinstance(simulation.edits[0].operation, Remove)
-    assert 0 < target.particles[-1].n_rows < target.particles[3].n_rows
-
-
 def test_viewer_is_not_imported_before_it_is_asked_for():
     code = "import gsim3d, gsim3d.viewer, gsim3d.viewer.server, sys; assert 'viser' not in sys.modules"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
@@ -297,11 +237,6 @@ def test_missing_viser_says_how_to_install_it(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "viser", None)
     assert main(["view", "a.ply"]) == 2
     assert "pip install 'gsim3d[viewer]'" in capsys.readouterr().err
-
-
-@pytest.fixture
-def viser():
-    return pytest.importorskip("viser", reason="needs viser")
 
 
 def test_server_answers_on_a_free_port_and_gives_it_back(viser):
