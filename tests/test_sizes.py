@@ -13,7 +13,7 @@ SPEC.loader.exec_module(sizes)
 TODAY = {
     "lines of the package": 38_500,
     "lines of the library without io": 13_900,
-    "lines of readers, writers and the viewer": 4_330,
+    "lines of readers, writers and the viewer": 4_440,
 }
 
 

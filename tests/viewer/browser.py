@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import json
 import os
 import select
@@ -71,6 +72,12 @@ class Browser:
 
     def open(self, url: str) -> None:
         self._call("Page.navigate", {"url": url})
+        end = time.monotonic() + 60
+        while time.monotonic() < end:
+            with contextlib.suppress(RuntimeError):  # between two pages there is none
+                if self.value("document.readyState === 'complete' && location.href !== 'about:blank'"):
+                    return
+            time.sleep(0.05)
 
     def value(self, expression: str):
         """The value of a JavaScript expression in the page."""

@@ -6,7 +6,6 @@ import sys
 import time
 import urllib.request
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -32,7 +31,6 @@ from gsim3d.viewer.live import (
 from gsim3d.viewer.targets import open_target
 from tests.test_simulator import SIZE
 from tests.tiny_scenes import N_CAMS
-from tests.viewer.browser import Browser, chromium
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 RED = (0.9, 0.1, 0.1)
@@ -274,29 +272,3 @@ def test_view_command_prints_the_address_and_ends_with_ctrl_c(viser, run, scene,
     assert "4 frames" in capsys.readouterr().out
     for wrong in (["--steps", "2"], ["--checkpoint", str(checkpoint), "--fps", "3"]):
         assert main(["view", str(scene), *wrong]) == 2
-
-
-@pytest.mark.skipif(chromium() is None, reason="needs Chromium")
-def test_browser_shows_the_gaussians(viser):
-    """A part of the page has their colour, its buttons work, and no request leaves the machine."""
-    frames = [splats(np.random.default_rng(seed).uniform(-0.5, 0.5, (200, 3)).tolist()) for seed in range(3)]
-    with server.Viewer(target_of(frames)) as viewer, Browser(1000, 600) as browser:
-        browser.open(viewer.address)
-
-        def share_of_red(enough: float) -> float:
-            end, share = time.monotonic() + 60, 0.0
-            while share < enough and time.monotonic() < end:
-                time.sleep(0.3)
-                shot = cv2.imdecode(np.frombuffer(browser.screenshot(), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
-                share = float((np.abs(shot / 255 - RED) < 0.1).all(-1).mean())
-            return share
-
-        assert 0.02 < share_of_red(0.02) < 0.9
-        find = "[...document.querySelectorAll('button')].find(button => button.textContent === 'Play')"
-        browser.value(f"{find}.click()")
-        end = time.monotonic() + 20
-        while viewer.timeline.frame == 0 and time.monotonic() < end:
-            time.sleep(0.02)
-        assert viewer.timeline.playing and viewer.timeline.frame > 0
-        local = ("data:", "blob:", viewer.address)
-        assert not [url for url in browser.requests if not url.startswith(local)]

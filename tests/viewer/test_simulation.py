@@ -96,9 +96,8 @@ def test_a_ray_hits_the_nearest_gaussian_that_is_shown():
 
 def test_switches_are_those_of_the_model_and_say_why_not(simulation):
     switches = {switch.name: switch for switch in simulation.switches()}
-    assert (
-        list(switches["history"].settings) == ["1 step", "2 steps", "4 steps"] and switches["history"].now == "2 steps"
-    )
+    history = switches["history"]
+    assert list(history.settings) == ["1 step", "2 steps", "4 steps"] and history.now == "2 steps"
     assert list(switches["sleep"].settings) == ["off", "exact"] and "approx: this model cannot" in switches["sleep"].why
     assert (
         list(switches["opacity_changes"].settings) == ["off"] and "holds opacities" in switches["opacity_changes"].why
@@ -129,8 +128,7 @@ def test_costs_are_measured_for_each_setting(simulation):
     assert simulation.target.n_frames == 5
 
 
-def body_color(simulation, frame):
-    rows = simulation.bodies(frame)[0]
+def body_color(simulation, frame, rows):
     return (0.5 + SH_0 * simulation.target.gaussians(frame).sh[rows, 0]).mean(0)
 
 
@@ -150,7 +148,8 @@ def test_panel_edits_the_body_that_is_chosen(viser, simulation, name, kind):
         panel._show_fields()
         assert panel._vector.visible == (name != "recolor") and panel._color.visible == (name == "recolor")
         panel._vector.value, panel._color.value, panel._steps.value = (0.0, 1.5, 0.5), (255, 0, 0), 2
-        rows, before, color = simulation.bodies(2)[0], target.particles[3], body_color(simulation, 3)
+        rows, before = simulation.bodies(2)[0], target.particles[3]
+        color = body_color(simulation, 3, rows)
         panel._simulate()
         assert viewer.timeline.n_frames == 5 and "ms a simulated step" in viewer._status.content
         (edit,) = simulation.edits
@@ -161,7 +160,7 @@ def test_panel_edits_the_body_that_is_chosen(viser, simulation, name, kind):
         if name == "duplicate":
             assert target.particles[3].n_rows == before.n_rows + len(rows)
         if name == "recolor":
-            red = body_color(simulation, 3)  # the largest body is the chosen one
+            red = body_color(simulation, 3, rows)
             assert red[0] > color[0] and red[1] < color[1] and red[2] < color[2]
 
 
