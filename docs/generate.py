@@ -26,6 +26,7 @@ def write_pages(folder: Path) -> None:
         "training_steps": training_steps(),
         "stability": stability(),
         "settings": settings(),
+        "notebook": notebook(ROOT / "examples" / "predict_look_edit_score.ipynb"),
         **{f"model_{name}": model(name) for name in model_names()},
         **{f"cost_{name}": cost(name) for name in model_names()},
     }
@@ -124,6 +125,21 @@ def settings() -> str:
     from gsim3d.profile.settings import GROUPS
 
     return table(("settings", "kind", "needs"), ((group.name, group.kind, group.needs or "-") for group in GROUPS))
+
+
+def notebook(file: Path) -> str:
+    """The cells of an executed notebook, with their pictures."""
+    parts = []
+    for cell in json.loads(file.read_text())["cells"]:
+        source = "".join(cell["source"])
+        parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
+        for output in cell.get("outputs", ()):
+            data = output.get("data", {})
+            if "image/jpeg" in data:
+                parts.append(f"![picture](data:image/jpeg;base64,{''.join(data['image/jpeg']).strip()})")
+            else:
+                parts.append("```text\n" + "".join(data.get("text/plain", output.get("text", ""))) + "\n```")
+    return "\n\n".join(parts) + "\n"
 
 
 # ---------------------------------------------------------------------------------------------- from stored numbers

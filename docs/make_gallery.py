@@ -41,13 +41,13 @@ from gsim3d.state import Particles  # noqa: E402
 from gsim3d.synth import generate  # noqa: E402
 from gsim3d.train.restore import Restored, restore  # noqa: E402
 from gsim3d.viewer.export import export  # noqa: E402
-from gsim3d.viewer.films import GAP, film_frames, write_text  # noqa: E402
+from gsim3d.viewer.films import ACCENT, GAP, WHITE, film_frames, write_text, write_time  # noqa: E402
 
 Rows = dict[str, np.ndarray]  # label -> images uint8 [S, V, H, W, 3]
 BODY = {"elastic": "star", "cloth": "blob", "rigid": "capsule"}  # world -> what falls
 SEED = 11  # of the scenes; none of the seeds of training
 EDITED, EDIT_STEPS, AT = "elastic-small", 56, 6  # simulator, predicted steps and step of the edits
-INSTANTS, TILE, QUALITY = 4, 256, 86  # of a poster: moments, pixels of each, JPEG quality
+INSTANTS, TILE, QUALITY = 4, 256, 76  # of a poster: moments, pixels of each, JPEG quality
 LARGEST = 100_000  # bytes of a poster
 
 
@@ -96,9 +96,9 @@ def poster(path: Path, rows: Rows, fps: float, first: int) -> None:
             if images[step, 0].shape[0] < TILE:
                 tile[:] = cv2.resize(images[step, 0], (TILE, TILE), interpolation=cv2.INTER_CUBIC)
             if j == 0 and label:
-                write_text(tile, label, (255, 255, 255))
+                write_text(tile, label, ACCENT if i else WHITE)
             if i == 0:
-                write_text(tile, f"{step / fps:.2f} s", (255, 255, 255), right=True)
+                write_time(tile, int(step), fps)
     write_whole(path, cv2.imencode(".jpg", canvas[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes())
     if path.stat().st_size > LARGEST:
         sys.exit(f"{path} has {path.stat().st_size} bytes; lower QUALITY or TILE")

@@ -188,16 +188,6 @@ def test_splat_record_by_hand(tmp_path):
     assert (0.5 + 0.28209479 * read.sh[0, 0]).tolist() == pytest.approx([1, 0, 0.2], abs=1e-6)
 
 
-def test_foreign_readers_agree(tmp_path):
-    gsply = pytest.importorskip("gsply", reason="gsply is not installed")
-    given = make(300, 3)
-    for suffix in (".ply", ".compressed.ply", ".spz"):
-        file = tmp_path / f"a{suffix}"
-        write_splats(file, given, up="z")
-        theirs = gsply.read_spz(str(file)) if suffix == ".spz" else gsply.plyread(str(file))
-        assert np.abs(theirs.means - read_splats(file, up="z").means.numpy()).max() < 1e-5, suffix
-
-
 @pytest.mark.parametrize("degree", range(4))
 def test_turned_splats_render_alike(degree):
     given = make(40, degree)

@@ -1,0 +1,99 @@
+"""Files that are written here, read by others where installed: gsply, usd-core, trimesh, the validator of Khronos."""
+
+import dataclasses
+import json
+import os
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from gsim3d.io import read_splats, write_splats
+from tests.io.test_formats import make, moving
+
+VALIDATE = """
+const validator = require("gltf-validator"), fs = require("fs");
+validator.validateBytes(new Uint8Array(fs.readFileSync(process.argv[1]))).then((r) => console.log(JSON.stringify(r)));
+"""
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz"])
+def test_gsply_reads_the_same(suffix, degree, tmp_path):
+    gsply = pytest.importorskip("gsply", reason="gsply is not installed")
+    file = tmp_path / f"a{suffix}"
+    write_splats(file, make(300, degree), up="z")
+    theirs = gsply.read_spz(str(file)) if suffix == ".spz" else gsply.plyread(str(file))
+    ours = read_splats(file, up="z")
+    assert np.abs(theirs.means - ours.means.numpy()).max() < 1e-5
+    assert np.abs(theirs.scales - ours.scales.log().numpy()).max() < 1e-4
+    seen = 1 / (1 + np.exp(-np.float64(theirs.opacities)))
+    assert np.abs(seen - ours.opacities.numpy()).max() < 1e-3
+    quats = torch.nn.functional.normalize(torch.from_numpy(np.array(theirs.quats)).double(), dim=1)
+    assert (quats * ours.quats).sum(1).abs().min() > 1 - 1e-5
+    assert np.abs(theirs.sh0 - ours.sh[:, 0].numpy()).max() < 1e-2
+    if degree:
+        assert np.abs(np.array(theirs.shN).reshape(300, -1, 3) - ours.sh[:, 1:].numpy()).max() < 2e-2
+
+
+def test_trimesh_reads_positions_of_glb_with_y_up(tmp_path):
+    given = make(50, 1)
+    write_splats(tmp_path / "a.glb", given)
+    scene = trimesh.load(tmp_path / "a.glb")
+    (name,) = scene.graph.nodes_geometry
+    place, geometry = scene.graph[name]
+    points = trimesh.transform_points(scene.geometry[geometry].vertices, place)
+    x, y, z = given.means.numpy().T
+    np.testing.assert_allclose(points, np.stack([x, z, -y], 1), atol=1e-5)
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_khronos_validator_knows_all_but_the_extension(degree, tmp_path):
+    """It may not know the names of the extension and of its attributes; all else must be right."""
+    if not shutil.which("node"):
+        pytest.skip("Node.js is not installed")
+    modules = (
+        os.environ.get("NODE_PATH") or subprocess.run(["npm", "root", "-g"], capture_output=True, text=True).stdout
+    )
+    environment = {**os.environ, "NODE_PATH": modules.strip()}
+    found = subprocess.run(["node", "-e", "require('gltf-validator')"], env=environment, capture_output=True)
+    if found.returncode:
+        pytest.skip("gltf-validator is not installed (npm install -g gltf-validator)")
+    write_splats(tmp_path / "a.glb", make(257, degree))
+    command = ["node", "-e", VALIDATE, str(tmp_path / "a.glb")]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    report = json.loads(done.stdout)
+    known = {"UNSUPPORTED_EXTENSION", "MESH_PRIMITIVE_ATTRIBUTE_UNUSED", "MESH_PRIMITIVE_INVALID_ATTRIBUTE"}
+    others = [
+        message
+        for message in report["issues"]["messages"]
+        if message["code"] not in known or "KHR_gaussian_splatting" not in json.dumps(message)
+    ]
+    assert not others and report["info"]["totalVertexCount"] == 257, others[:5]
+
+
+def test_usd_keeps_rate_axis_and_unit(tmp_path):
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    from pxr import Usd, UsdGeom
+
+    write_splats(tmp_path / "a.usdc", moving(3), fps=12.5)
+    stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
+    assert (stage.GetTimeCodesPerSecond(), stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (12.5, 0, 2)
+    assert UsdGeom.GetStageUpAxis(stage) == "Z" and UsdGeom.GetStageMetersPerUnit(stage) == 1
+    first = {prim.GetName(): prim for prim in stage.Traverse()}["moving"]
+    assert np.array_equal(np.array(first.GetAttribute("extent").Get(2)).shape, (2, 3))
+
+
+def test_usd_stores_all_where_all_moves(tmp_path):
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    from pxr import Usd
+
+    first = make(20, 0)
+    frames = [dataclasses.replace(first, means=first.means + 0.1 * step) for step in range(2)]
+    write_splats(tmp_path / "a.usda", frames, fps=10)
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    names = {prim.GetName() for prim in stage.Traverse()}
+    assert names == {"Gaussians", "moving"}
