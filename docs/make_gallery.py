@@ -37,6 +37,8 @@ from gsim3d.evaluate.pictures import as_bytes, true_images, write_gaussians  # n
 from gsim3d.evaluate.protocol import default_views, encode_folder, predict, render_steps  # noqa: E402
 from gsim3d.io import write_video  # noqa: E402
 from gsim3d.io.files import write_whole  # noqa: E402
+from gsim3d.io.orbit import orbit_frames  # noqa: E402
+from gsim3d.io.sequence import open_sequence  # noqa: E402
 from gsim3d.state import Particles  # noqa: E402
 from gsim3d.synth import generate  # noqa: E402
 from gsim3d.train.restore import Restored, restore  # noqa: E402
@@ -48,6 +50,7 @@ BODY = {"elastic": "star", "cloth": "blob", "rigid": "capsule"}  # world -> what
 SEED = 11  # of the scenes; none of the seeds of training
 EDITED, EDIT_STEPS, AT = "elastic-small", 56, 6  # simulator, predicted steps and step of the edits
 INSTANTS, TILE, QUALITY = 4, 256, 76  # of a poster: moments, pixels of each, JPEG quality
+TURNS = 0.5  # of the camera of the orbit
 LARGEST = 100_000  # bytes of a poster
 
 
@@ -149,11 +152,10 @@ def orbit(out: Path, posters: Path, frames: int | None) -> None:
     film = out / "orbit.mp4"
     write_gaussians(out / "orbit", restored, prediction, scene.fps)
     film.unlink(missing_ok=True)
-    export(out / "orbit", film, turns=0.5)
-    video, images = cv2.VideoCapture(str(film)), []
-    while (read := video.read())[0]:
-        images.append(read[1][None, ..., ::-1])
-    poster(posters / "orbit.jpg", {"": np.stack(images)}, scene.fps, 0)
+    export(out / "orbit", film, turns=TURNS)
+    frames = open_sequence(out / "orbit")
+    images = np.stack(list(orbit_frames(frames, len(frames), TILE, TURNS)))[:, None]
+    poster(posters / "orbit.jpg", {"": images}, scene.fps, 0)
 
 
 @torch.no_grad()
