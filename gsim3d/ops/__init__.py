@@ -24,7 +24,9 @@ from gsim3d.ops.decode import decode_gaussians
 from gsim3d.ops.patch_attn import joint_attention, patch_attention
 from gsim3d.ops.plane_sweep import plane_sweep, sweep_geometry
 from gsim3d.ops.pool import pool_max, pool_mean, unpool
+from gsim3d.ops.projection import Projection, project_gaussians, sh_to_color
 from gsim3d.ops.raster import Rendering, rasterize_gaussians
+from gsim3d.ops.raster_projected import rasterize_projected
 from gsim3d.ops.row_norm import norm_gelu, residual_norm, row_norm
 from gsim3d.ops.sparse_conv import sparse_conv
 from gsim3d.ops.validate_state import PartialRecord, ValidatedState, join_records, validate_state
@@ -34,6 +36,7 @@ __all__ = [
     "KernelMap",
     "PartialRecord",
     "PatchTable",
+    "Projection",
     "Pyramid",
     "PyramidCapacity",
     "PyramidSpec",
@@ -57,10 +60,13 @@ __all__ = [
     "plane_sweep",
     "pool_max",
     "pool_mean",
+    "project_gaussians",
     "rasterize_gaussians",
+    "rasterize_projected",
     "residual_norm",
     "row_norm",
     "row_scenes",
+    "sh_to_color",
     "sparse_conv",
     "sweep_geometry",
     "unpool",

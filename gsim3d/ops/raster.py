@@ -150,7 +150,7 @@ def rasterize_gaussians(
         near_plane,
         CUTOFFS[cutoff],
         JACOBIANS[jacobian],
-        *_sizes_of_state(means, n_images, cu_rows.shape[0] - 1, cameras.width, cameras.height),
+        *sizes_of_state(means, n_images, cu_rows.shape[0] - 1, cameras.width, cameras.height),
         watch,
     )
     if compiling:
@@ -249,7 +249,7 @@ def _tiles(n_images, width, height):
     return n_images * ((width + 15) // 16) * ((height + 15) // 16)
 
 
-def _sizes_of_state(means, n_images, n_clouds, width, height):
+def sizes_of_state(means, n_images, n_clouds, width, height):
     """(max_pairs, max_entries, max_slots): RasterLimits of csrc/gsim3d/raster/raster.h. Exact for clouds shown by
     equally many images; about twice what Gaussians of a few pixels need."""
     if means.device.type != "cuda":
@@ -262,7 +262,7 @@ def _sizes_of_state(means, n_images, n_clouds, width, height):
     return pairs, max(n, entries), max(4 * n, slots)
 
 
-def _state_bytes(means, n_images, n_clouds, width, height, max_pairs, max_slots):
+def state_bytes(means, n_images, n_clouds, width, height, max_pairs, max_slots):
     """raster_state_bytes of csrc/gsim3d/raster/raster.h."""
     if means.device.type != "cuda":
         return 0
@@ -278,7 +278,7 @@ def _(means, quats, scales, opacities, color, features, background, viewmats, *r
     _, _, cu_rows, width, height, _, _, _, *sizes, watch = rest  # Ks, image_cloud, near_plane and modes do not count
     n_images = viewmats.shape[0]
     shape = (n_images, height, width)
-    state = _state_bytes(means, n_images, cu_rows.shape[0] - 1, width, height, sizes[0], sizes[2])
+    state = state_bytes(means, n_images, cu_rows.shape[0] - 1, width, height, sizes[0], sizes[2])
     return (
         means.new_empty(*shape, 3),
         means.new_empty(shape),

@@ -31,6 +31,8 @@ enum class RasterJacobian : int64_t {
   kClamped = 1,  // at most 0.15 of the image outside of it, as 3DGS and gsplat do
 };
 
+constexpr int kProjected = -1;  // in place of RasterScene::sh_terms: the rows are projected, each for one image
+
 template <typename T>
 struct RasterScene {
   const T* means;       // [n_rows, 3] metres, world
@@ -45,11 +47,16 @@ struct RasterScene {
   const int64_t* image_cloud;  // [n_images]
   const int64_t* cu_rows;      // [n_clouds + 1]
   int64_t n_rows, n_clouds, n_images;
-  int64_t sh_terms;  // 0, 1, 4, 9 or 16
+  int64_t sh_terms;  // 0, 1, 4, 9, 16 or kProjected
   int64_t n_features, width, height;
   T near_plane;  // metres; Gaussians whose centre is not beyond it are left out
   RasterCutoff cutoff;
   RasterJacobian jacobian = RasterJacobian::kExact;
+  // Of projected rows, in place of means, quats, scales, viewmats and Ks. A row whose conic is not positive definite, or
+  // whose depth is not positive, is left out.
+  const T* means2d = nullptr;  // [n_rows, 2] pixels
+  const T* conics = nullptr;   // [n_rows, 3] xx, xy, yy of the inverse covariance, px^-2
+  const T* depths = nullptr;   // [n_rows] metres
 };
 
 // What makes a row unusable; bits. Such a row is left out of the images, and its gradients are 0.
@@ -106,9 +113,17 @@ struct RasterSceneGrads {
   T* scales;
   T* opacities;
   T* color;
-  T* features;
+  T* features;  // [n_rows, n_features], or with `absolute` two more columns
   T* background;
   T* viewmats;  // of the 12 upper entries taken as free numbers, the last row is 0; null: not wanted
+  // Of projected rows.
+  T* means2d = nullptr;
+  T* conics = nullptr;
+  T* depths = nullptr;
+  // Whether the last two columns of `features` are sums over pixels of what each adds to |gradient| of means2d.
+  bool absolute = false;
+
+  int64_t feature_columns(int64_t n_features) const { return n_features + (absolute ? 2 : 0); }
 };
 
 namespace cpu {

@@ -5,9 +5,9 @@
 namespace gsim3d::cuda {
 namespace {
 
-template <typename T, bool kFade, bool kWithFeatures>
+template <typename T, bool kFade, bool kWithFeatures, bool kAbsolute>
 __global__ void __launch_bounds__(kWarp) blend_vjp_kernel(Job<T> job, RasterImageGrads<T> grads, Slots<T> slots) {
-  blend_tiles_vjp<T, kFade>(job, grads, slots, of_warp<BlendGradShared<T, kWithFeatures>>());
+  blend_tiles_vjp<T, kFade, kAbsolute>(job, grads, slots, of_warp<BlendGradShared<T, kWithFeatures>>());
 }
 
 template <typename T, int kTerms>
@@ -35,6 +35,7 @@ __device__ void gather_any(const Job<T>& job, const Slots<T>& slots, const Raste
     gather_rows<T, kTerms>(job, slots, grads, dynamic_memory);
   };
   switch (job.scene.sh_terms) {
+    case kProjected: return gather(std::integral_constant<int, kProjected>{});
     case 0: return gather(std::integral_constant<int, 0>{});
     case 1: return gather(std::integral_constant<int, 1>{});
     case 4: return gather(std::integral_constant<int, 4>{});
@@ -52,7 +53,10 @@ __global__ void __launch_bounds__(kBlock) further_vjp_kernel(Job<T> first, Job<T
     for (int64_t i = int64_t{blockIdx.x} * kBlock + threadIdx.x; i < job.limits.slots; i += int64_t{gridDim.x} * kBlock)
       slots.live[i] = 0;
     grid.sync();
-    blend_tiles_vjp<T, kFade>(job, image_grads, slots, of_warp<BlendGradShared<T, true>>());
+    if (grads.absolute)
+      blend_tiles_vjp<T, kFade, true>(job, image_grads, slots, of_warp<BlendGradShared<T, true>>());
+    else
+      blend_tiles_vjp<T, kFade, false>(job, image_grads, slots, of_warp<BlendGradShared<T, true>>());
     grid.sync();
     gather_any(job, slots, grads);
     gather_images(job, slots, grads);
@@ -61,16 +65,17 @@ __global__ void __launch_bounds__(kBlock) further_vjp_kernel(Job<T> first, Job<T
 }
 
 template <typename T>
-Slots<T> take_slots(const Job<T>& first, const Job<T>& further, bool viewmats, Arena& scratch) {
+Slots<T> take_slots(const Job<T>& first, const Job<T>& further, const RasterSceneGrads<T>& grads, Arena& scratch) {
   const RasterScene<T>& s = first.scene;
   const int64_t n = std::max(first.limits.slots, further.limits.slots);
   Slots<T> slots{};
   slots.sums = scratch.take<SlotSums<T>>(n);
-  slots.features = scratch.take<T>(n * s.n_features);
+  slots.n_columns = grads.feature_columns(s.n_features);
+  slots.features = scratch.take<T>(n * slots.n_columns);
   slots.live = scratch.take<unsigned char>(n);
   slots.unfinished = scratch.take<SlotSums<T>>(s.n_rows);
   slots.backgrounds = scratch.take<T>(s.n_images * first.n_tiles * kQuarters * 3);
-  if (viewmats) slots.viewmats = scratch.take<T>(s.n_images * kViewmatParts * 12);
+  if (grads.viewmats) slots.viewmats = scratch.take<T>(s.n_images * kViewmatParts * 12);
   return slots;
 }
 
@@ -82,7 +87,7 @@ void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& ima
                      const Workspace& workspace, Stream stream) {
   check_options(scene);
   check_limits(scene, limits);
-  fill_zero(kRaster, grads.features, scene.n_rows * scene.n_features, stream);
+  fill_zero(kRaster, grads.features, scene.n_rows * grads.feature_columns(scene.n_features), stream);
   if (scene.n_images == 0) {
     fill_zero(kRaster, grads.means, scene.n_rows * 3, stream);
     fill_zero(kRaster, grads.quats, scene.n_rows * 4, stream);
@@ -94,16 +99,21 @@ void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& ima
   const bool viewmats = grads.viewmats != nullptr;
   Arena kept(state), unused, count;
   const Job<T> job = first_job(scene, limits, kept, unused);
-  take_slots(job, further_job(job, count), viewmats, count);
+  take_slots(job, further_job(job, count), grads, count);
   Arena scratch(workspace.take<unsigned char>(count.used()));
   const Job<T> further = further_job(job, scratch);
-  const Slots<T> slots = take_slots(job, further, viewmats, scratch);
+  const Slots<T> slots = take_slots(job, further, grads, scratch);
 
   fill_zero(kRaster, slots.live, limits.slots, stream);
   dispatch_blend(scene, [&](auto fade, auto with_features) {
     constexpr bool kFade = decltype(fade)::value, kWithFeatures = decltype(with_features)::value;
-    launch(kRaster, blend_vjp_kernel<T, kFade, kWithFeatures>, grid_for(scene.n_images * job.n_tiles * kQuarters, 1),
-           kWarp, sizeof(BlendGradShared<T, kWithFeatures>), stream, job, image_grads, slots);
+    const unsigned grid = grid_for(scene.n_images * job.n_tiles * kQuarters, 1);
+    if (grads.absolute)
+      launch(kRaster, blend_vjp_kernel<T, kFade, true, true>, grid, kWarp, sizeof(BlendGradShared<T, true>), stream,
+             job, image_grads, slots);
+    else
+      launch(kRaster, blend_vjp_kernel<T, kFade, kWithFeatures, false>, grid, kWarp,
+             sizeof(BlendGradShared<T, kWithFeatures>), stream, job, image_grads, slots);
   });
   dispatch_sh(scene.sh_terms, [&](auto terms) {
     constexpr int kTerms = decltype(terms)::value;

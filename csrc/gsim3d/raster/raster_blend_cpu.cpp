@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <memory>
+#include <type_traits>
 #include <utility>
 
 #include "gsim3d/raster/raster_tiles.h"
@@ -200,13 +201,13 @@ void blend_tile(const RasterScene<T>& scene, const Group<T>& group, const Raster
 
 // From back to front. With s = <grad, values of the splat> at a pixel and S the same sum over all that lies behind it,
 // weighted: grad_alpha = T s - S / (1 - alpha). T before a splat is T behind it / (1 - alpha).
-template <typename T, bool kFade>
+template <typename T, bool kFade, bool kAbsolute>
 void blend_tile_vjp(const RasterScene<T>& scene, const Group<T>& group, const RasterImageGrads<T>& grads, int64_t task,
                     T* slots, T* tile_background) {
   using V = Simd<T>;
   using Int = IntOf<T>;
   const Tile<T> tile(scene, group, task);
-  const int64_t n_features = scene.n_features, slot_width = kSlotFixed + n_features;
+  const int64_t n_features = scene.n_features, slot_width = kSlotFixed + n_features + (kAbsolute ? 2 : 0);
   const T* background = scene.background + 3 * tile.image;
 
   alignas(32) T light_behind[kPixels] = {}, behind[kPixels] = {}, grad[4][kPixels] = {};
@@ -241,7 +242,7 @@ void blend_tile_vjp(const RasterScene<T>& scene, const Group<T>& group, const Ra
     const T* feature = scene.features + tile.row(k) * n_features;
     const T values[4] = {splat.color[0], splat.color[1], splat.color[2], splat.z};
     const SimdMask<T> index = SimdMask<T>{} + static_cast<Int>(k);
-    V sums[kSlotFixed] = {};
+    V sums[kSlotFixed] = {}, absolute[2] = {};
     std::fill(feature_sums.begin(), feature_sums.end(), V{});
     for_vectors(splat, tile.x0, tile.y0, [&](int pixel, V u, T dy, V exponent) {
       const V raw = exp2_of(exponent) * splat.opacity;
@@ -277,10 +278,16 @@ void blend_tile_vjp(const RasterScene<T>& scene, const Group<T>& group, const Ra
       sums[3] += vu * dy;
       sums[4] += v * (dy * dy);
       sums[5] += v;
+      if constexpr (kAbsolute) {
+        const V by_u = vu * splat.tight;
+        absolute[0] += abs_of(by_u), absolute[1] += abs_of(v * (splat.loose * dy) - by_u * splat.slope);
+      }
     });
     T* slot = slots + (tile.begin + tile.place(k)) * slot_width;
     for (int c = 0; c < kSlotFixed; ++c) slot[c] = sum_lanes(sums[c]);
     for (int64_t c = 0; c < n_features; ++c) slot[kSlotFixed + c] = sum_lanes(feature_sums[c]);
+    for (int c = 0; c < 2 && kAbsolute; ++c)
+      slot[kSlotFixed + n_features + c] = sum_lanes(absolute[c]) * T(1 / kLog2eHalf);
   }
 }
 
@@ -306,14 +313,16 @@ void blend_group(const RasterScene<T>& scene, const Group<T>& group, const Raste
 
 template <typename T>
 void blend_group_vjp(const RasterScene<T>& scene, const Group<T>& group, const RasterImageGrads<T>& image_grads,
-                     T* slots, T* tile_background, T* grad_background, const Parallel& parallel) {
+                     T* slots, T* tile_background, T* grad_background, bool absolute, const Parallel& parallel) {
   const int64_t n_tiles = group.n_tiles(), n = (group.last - group.first) * n_tiles;
   parallel.chunks(n, [&](int64_t i) {
     const int64_t task = mixed(i, n);
-    if (scene.cutoff == RasterCutoff::kSmooth)
-      blend_tile_vjp<T, true>(scene, group, image_grads, task, slots, tile_background + 3 * task);
-    else
-      blend_tile_vjp<T, false>(scene, group, image_grads, task, slots, tile_background + 3 * task);
+    const auto blend = [&](auto fade, auto with_absolute) {
+      blend_tile_vjp<T, decltype(fade)::value, decltype(with_absolute)::value>(scene, group, image_grads, task, slots,
+                                                                               tile_background + 3 * task);
+    };
+    const auto with = [&](auto fade) { absolute ? blend(fade, std::true_type{}) : blend(fade, std::false_type{}); };
+    scene.cutoff == RasterCutoff::kSmooth ? with(std::true_type{}) : with(std::false_type{});
   });
   for (int64_t task = 0; task < n; ++task) {
     T* grad = grad_background + 3 * (group.first + task / n_tiles);
@@ -324,7 +333,7 @@ void blend_group_vjp(const RasterScene<T>& scene, const Group<T>& group, const R
 #define GSIM3D_INSTANTIATE(T)                                                                                          \
   template void blend_group<T>(const RasterScene<T>&, const Group<T>&, const RasterImages<T>&, const Parallel&);       \
   template void blend_group_vjp<T>(const RasterScene<T>&, const Group<T>&, const RasterImageGrads<T>&, T*, T*, T*,     \
-                                   const Parallel&);
+                                   bool, const Parallel&);
 GSIM3D_INSTANTIATE(float)
 GSIM3D_INSTANTIATE(double)
 #undef GSIM3D_INSTANTIATE

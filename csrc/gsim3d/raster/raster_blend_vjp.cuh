@@ -20,7 +20,8 @@ struct alignas(2 * sizeof(T)) SlotSums {
 template <typename T>
 struct Slots {
   SlotSums<T>* sums;    // [slots], unset where not live
-  T* features;          // [slots, n_features], the same
+  T* features;          // [slots, n_columns], the same
+  int64_t n_columns;    // n_features, or two more: |gradient| of the mean, pixel by pixel
   unsigned char* live;  // [slots] 1 where a pixel may have seen the entry
   SlotSums<T>* unfinished;  // [n_rows] sums of an image's tiles in earlier groups
   T* backgrounds;       // [n_images * n_tiles * kQuarters, 3]
@@ -125,7 +126,7 @@ __device__ void sum_features(const RasterScene<T>& s, const RasterImageGrads<T>&
 
 // From back to front. With s = <grad, values of the entry> at a pixel and S the same sum over all that lies behind it,
 // weighted: grad_alpha = T s - S / (1 - alpha). T before an entry is T behind it / (1 - alpha).
-template <typename T, bool kFade, bool kWithFeatures>
+template <typename T, bool kFade, bool kWithFeatures, bool kAbsolute>
 __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& grads, int64_t index,
                                   const Slots<T>& slots, BlendGradShared<T, kWithFeatures>& shared) {
   const RasterScene<T>& s = job.scene;
@@ -188,6 +189,8 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
     }
     const T from_x = T(quarter.x0 + kQuarter / 2) - record.x, from_y = T(quarter.y0 + kQuarter / 2) - record.y;
     const T slope = record.slope;
+    const T tight = record.tight * record.tight * T(1 / kLog2eHalf);  // of Footprint
+    const T loose = record.loose * record.loose * T(1 / kLog2eHalf);
     const T* entry_features = kWithFeatures && used ? features_of(job, quarter.image, pair) : nullptr;
     int64_t slot = 0;
     if (used) {
@@ -200,6 +203,7 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
 
     SlotSums<T> sums{};
     QuarterSums<T> moments;
+    T absolute[2] = {};
     uint32_t live = 0;  // not 0: a pixel may have seen the entry
 #pragma unroll
     for (int half = 0; half < kHalves; ++half) {
@@ -251,6 +255,11 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
           share.v = visited_by >> p & 1 ? share.v : T(0), share.weight = visited_by >> p & 1 ? share.weight : T(0);
           const PixelGrad<T> grad = shared.grad[half * kWarp + p];
           const T from_centre = T(column) - T(kQuarter - 1) / 2;
+          if constexpr (kAbsolute) {
+            const T dy = from_y + (T(half * kHalfRows + row) - T(kQuarter - 1) / 2);
+            const T by_u = share.v * (tight * (from_x + from_centre - slope * dy));
+            absolute[0] += abs_of(by_u), absolute[1] += abs_of(share.v * (loose * dy) - slope * by_u);
+          }
           one += share.v, vx += share.v * from_centre, vxx += share.v * (from_centre * from_centre);
           for (int c = 0; c < 4; ++c) sums.value[6 + c] += share.weight * grad.value[c];
         }
@@ -260,22 +269,24 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
       }
       if constexpr (kWithFeatures)
         sum_features(s, grads, pixel, lane, visited_by, half > 0, shared,
-                     used ? slots.features + slot * s.n_features : nullptr);
+                     used ? slots.features + slot * slots.n_columns : nullptr);
       __syncwarp();
     }
     if (live) {
       moments.finish(from_x - slope * from_y, from_y, slope, sums);
       slots.sums[slot] = sums;
+      for (int i = 0; i < 2 && kAbsolute; ++i)
+        slots.features[slot * slots.n_columns + s.n_features + i] = absolute[i];
       slots.live[slot] = 1;
     }
   }
 }
 
-template <typename T, bool kFade, bool kWithFeatures>
+template <typename T, bool kFade, bool kAbsolute, bool kWithFeatures>
 __device__ void blend_tiles_vjp(const Job<T>& job, const RasterImageGrads<T>& grads, const Slots<T>& slots,
                                 BlendGradShared<T, kWithFeatures>& shared) {
   for (WarpQuarters quarters(job); quarters.more(); quarters.next())
-    blend_quarter_vjp<T, kFade>(job, grads, quarters.index(), slots, shared);
+    blend_quarter_vjp<T, kFade, kWithFeatures, kAbsolute>(job, grads, quarters.index(), slots, shared);
 }
 
 }  // namespace gsim3d::raster

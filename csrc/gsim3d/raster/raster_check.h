@@ -16,7 +16,7 @@ void check_options(const RasterScene<T>& s) {
   constexpr const char* kOp = "rasterize_gaussians";
   check(s.width >= 1 && s.height >= 1 && s.width <= kMaxPixels && s.height <= kMaxPixels, kOp,
         ": width and height must be in [1, ", kMaxPixels, "]; got ", s.width, " and ", s.height);
-  check(s.sh_terms == 0 || s.sh_terms == 1 || s.sh_terms == 4 || s.sh_terms == 9 || s.sh_terms == 16, kOp,
+  check(s.sh_terms == kProjected || s.sh_terms == 0 || s.sh_terms == 1 || s.sh_terms == 4 || s.sh_terms == 9 || s.sh_terms == 16, kOp,
         ": sh must have 1, 4, 9 or 16 coefficients (degree 0 to 3); got ", s.sh_terms);
   check(std::isfinite(s.near_plane) && s.near_plane > 0, kOp, ": near_plane must be positive; got ", s.near_plane);
   const auto cutoff = static_cast<int64_t>(s.cutoff);
@@ -39,10 +39,11 @@ void check_limits(const RasterScene<T>& s, const cuda::RasterLimits& limits) {
   check_range("max_slots", limits.slots, 4 * s.n_rows, INT32_MAX);
 }
 
-// Calls f(std::integral_constant<int, terms>) for the number of SH terms of the scene (0: given colours).
+// Calls f(std::integral_constant<int, terms>) for the number of SH terms of the scene (0: given colours; kProjected).
 template <typename F>
 void dispatch_sh(int64_t terms, const F& f) {
   switch (terms) {
+    case kProjected: return f(std::integral_constant<int, kProjected>{});
     case 0: return f(std::integral_constant<int, 0>{});
     case 1: return f(std::integral_constant<int, 1>{});
     case 4: return f(std::integral_constant<int, 4>{});

@@ -24,6 +24,10 @@ void check_scene(const RasterScene<T>& s) {
   for (int64_t i = 0; i < s.n_images; ++i) {
     check(s.image_cloud[i] >= 0 && s.image_cloud[i] < s.n_clouds, kOp,
           ": image_cloud must be in [0, Q) with Q=", s.n_clouds, "; got ", s.image_cloud[i], " for image ", i);
+    for (int c = 0; c < 3; ++c)
+      check(usable(s.background[3 * i + c]), kOp, ": background must be finite and at most 1e15; got ",
+            s.background[3 * i + c], " for image ", i);
+    if (s.sh_terms == kProjected) continue;
     for (int j = 0; j < 12; ++j)
       check(usable(s.viewmats[16 * i + j]), kOp, ": viewmats must be finite and at most 1e15; got ",
             s.viewmats[16 * i + j], " for image ", i);
@@ -34,9 +38,6 @@ void check_scene(const RasterScene<T>& s) {
           " for image ", i);
     check(K[3] == 0 && K[6] == 0 && K[7] == 0 && K[8] == 1, kOp,
           ": Ks must be [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]; got another pattern for image ", i);
-    for (int c = 0; c < 3; ++c)
-      check(usable(s.background[3 * i + c]), kOp, ": background must be finite and at most 1e15; got ",
-            s.background[3 * i + c], " for image ", i);
   }
 }
 
@@ -121,6 +122,29 @@ void project_chunk_vjp(const RasterScene<T>& scene, const Group<T>& group, const
   for (int i = 0; i < 12; ++i) grad_viewmat[i] = sum_lanes(viewmat_sums[i]);
 }
 
+// The same of rows that are projected already.
+template <typename T>
+void read_chunk_vjp(const RasterScene<T>& scene, const Group<T>& group, const Chunk& chunk, const T* slots,
+                    const RasterSceneGrads<T>& grads) {
+  const int64_t n_columns = grads.feature_columns(scene.n_features), slot_width = kSlotFixed + n_columns;
+  for (int64_t row = chunk.begin; row < chunk.end; ++row) {
+    const int64_t pair = chunk.pair + row - chunk.begin;
+    if (group.pair_begin[pair] == group.pair_begin[pair + 1]) continue;
+    T sum[kSlotFixed] = {};
+    for (int64_t i = group.pair_begin[pair]; i < group.pair_begin[pair + 1]; ++i) {
+      const T* slot = slots + group.positions[i] * slot_width;
+      for (int c = 0; c < kSlotFixed; ++c) sum[c] += slot[c];
+      for (int64_t c = 0; c < n_columns; ++c) grads.features[row * n_columns + c] += slot[kSlotFixed + c];
+    }
+    const T* conic = scene.conics + 3 * row;
+    conic_vjp(footprint_of_conic(conic[0], conic[1], conic[2]), Moments<T>{sum[0], sum[1], sum[2], sum[3], sum[4]},
+              grads.means2d + 2 * row, grads.conics + 3 * row);
+    grads.opacities[row] = sum[5] / scene.opacities[row];
+    for (int c = 0; c < 3; ++c) grads.color[3 * row + c] = sum[6 + c];
+    grads.depths[row] = sum[9];
+  }
+}
+
 // Runs of rows of one cloud: their chunks in all images of the group, in order of images. One task owns the rows'
 // gradients.
 template <typename T>
@@ -160,29 +184,39 @@ template <typename T>
 void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& image_grads,
                      const RasterSceneGrads<T>& grads, const Workspace& workspace, const Parallel& parallel) {
   check_scene(scene);
-  const int64_t n = scene.n_rows;
-  std::fill_n(grads.means, n * 3, T(0));
-  std::fill_n(grads.quats, n * 4, T(0));
-  std::fill_n(grads.scales, n * 3, T(0));
+  const int64_t n = scene.n_rows, n_columns = grads.feature_columns(scene.n_features);
+  if (scene.sh_terms == kProjected) {
+    std::fill_n(grads.means2d, n * 2, T(0));
+    std::fill_n(grads.conics, n * 3, T(0));
+    std::fill_n(grads.depths, n, T(0));
+  } else {
+    std::fill_n(grads.means, n * 3, T(0));
+    std::fill_n(grads.quats, n * 4, T(0));
+    std::fill_n(grads.scales, n * 3, T(0));
+  }
   std::fill_n(grads.opacities, n, T(0));
   std::fill_n(grads.color, n * std::max<int64_t>(1, scene.sh_terms) * 3, T(0));
-  std::fill_n(grads.features, n * scene.n_features, T(0));
+  std::fill_n(grads.features, n * n_columns, T(0));
   std::fill_n(grads.background, scene.n_images * 3, T(0));
   if (grads.viewmats) std::fill_n(grads.viewmats, scene.n_images * 16, T(0));
 
   Scratch scratch(workspace);
   Group<T> group;
   while (next_group(scene, true, scratch, parallel, group)) {
-    T* slots = scratch.take<T>(kSlots, group.n_instances * (kSlotFixed + scene.n_features));
+    T* slots = scratch.take<T>(kSlots, group.n_instances * (kSlotFixed + n_columns));
     T* tile_background = scratch.take<T>(kBackground, (group.last - group.first) * group.n_tiles() * 3);
-    blend_group_vjp(scene, group, image_grads, slots, tile_background, grads.background, parallel);
+    blend_group_vjp(scene, group, image_grads, slots, tile_background, grads.background, grads.absolute, parallel);
 
     T* viewmats = scratch.take<T>(kViewmats, static_cast<int64_t>(group.chunks.size()) * 12);
     const auto tasks = chunks_by_rows(scene, group);
     parallel.chunks(static_cast<int64_t>(tasks.size()), [&](int64_t task) {
       for (int64_t c : tasks[task])
         dispatch_sh(scene.sh_terms, [&](auto terms) {
-          project_chunk_vjp<T, decltype(terms)::value>(scene, group, group.chunks[c], slots, grads, viewmats + 12 * c);
+          constexpr int kTerms = decltype(terms)::value;
+          if constexpr (kTerms == kProjected)
+            read_chunk_vjp(scene, group, group.chunks[c], slots, grads);
+          else
+            project_chunk_vjp<T, kTerms>(scene, group, group.chunks[c], slots, grads, viewmats + 12 * c);
         });
     });
     for (size_t c = 0; c < group.chunks.size() && grads.viewmats; ++c)

@@ -17,7 +17,7 @@ __device__ bool sum_slots(const Job<T>& job, const Group& group, int64_t row, co
   const bool seen = bounds.x0 < bounds.x1;
   const int n = seen ? group.n_slots(squares_of(bounds, kTile), squares_of(bounds, kQuarter)) : 0;
   const int lane = threadIdx.x % kWarp;
-  const int64_t n_features = job.scene.n_features;
+  const int64_t n_features = slots.n_columns;
   const unsigned char* live = slots.live + slot_begin;
   bool any = seen && group.resumed;
   sums = any ? slots.unfinished[row] : SlotSums<T>{};
@@ -89,6 +89,40 @@ struct RowGrad {
   }
 };
 
+// The same of a row that is projected already, and that one image shows.
+template <typename T>
+struct FlatGrad {
+  T mean[2], conic[3], depth, opacity;
+
+  __device__ void load(const RasterSceneGrads<T>& from, int64_t row) {
+    for (int i = 0; i < 2; ++i) mean[i] = from.means2d[2 * row + i];
+    for (int i = 0; i < 3; ++i) conic[i] = from.conics[3 * row + i];
+    depth = from.depths[row], opacity = from.opacities[row];
+  }
+  __device__ void finish(const FlatGaussian<T>&) {}
+  __device__ void store(const RasterSceneGrads<T>& to, int64_t row) const {
+    for (int i = 0; i < 2; ++i) to.means2d[2 * row + i] = mean[i];
+    for (int i = 0; i < 3; ++i) to.conics[3 * row + i] = conic[i];
+    to.depths[row] = depth, to.opacities[row] = opacity;
+  }
+};
+
+template <typename T, int kTerms>
+using RowGradOf = std::conditional_t<kTerms == kProjected, FlatGrad<T>, RowGrad<T>>;
+
+template <typename T, int kTerms>
+__device__ void project_vjp_of(const Camera<T>&, const FlatGaussian<T>& gaussian, const T*, const SlotSums<T>& slot,
+                               FlatGrad<T>& row, T* grad_color, T (&)[12]) {
+  const T *sums = slot.value, *conic = gaussian.conic;
+  T grad_mean[2], grad_conic[3];
+  conic_vjp(footprint_of_conic(conic[0], conic[1], conic[2]), Moments<T>{sums[0], sums[1], sums[2], sums[3], sums[4]},
+            grad_mean, grad_conic);
+  for (int i = 0; i < 2; ++i) row.mean[i] += grad_mean[i];
+  for (int i = 0; i < 3; ++i) row.conic[i] += grad_conic[i], grad_color[i] += sums[6 + i];
+  row.opacity += sums[5] / gaussian.opacity;
+  row.depth += sums[9];
+}
+
 // Adds the gradients of a row in one image to `row`, `grad_color` (unless null) and `viewmat`.
 template <typename T, int kTerms>
 __device__ void project_vjp_of(const Camera<T>& camera, const Gaussian<T>& gaussian, const T* coefficients,
@@ -130,7 +164,7 @@ __device__ void gather_rows(const Job<T>& job, const Slots<T>& slots, const Rast
   constexpr int kColumns = kColorColumns<kTerms>;
   const SharedRows<T, kColumns> colors(memory), grad_colors(memory + SharedRows<T, kColumns>::kBytes);
   if (!group.rows_are_good) {
-    const RowGrad<T> none{};
+    const RowGradOf<T, kTerms> none{};
     for (int64_t row = int64_t{blockIdx.x} * kBlock + threadIdx.x; row < s.n_rows; row += int64_t{gridDim.x} * kBlock) {
       none.store(grads, row);
       for (int i = 0; i < kColumns; ++i) grads.color[row * kColumns + i] = 0;
@@ -143,8 +177,8 @@ __device__ void gather_rows(const Job<T>& job, const Slots<T>& slots, const Rast
     if (rows.first_image >= group.last && !is_first) continue;
     colors.load(s.color + rows.begin * kColumns, rows.count);
     const int64_t row = rows.inside ? rows.row : rows.begin;
-    const Gaussian<T> gaussian(s, row);
-    RowGrad<T> grad{};
+    const GaussianOf<T, kTerms> gaussian(s, row);
+    RowGradOf<T, kTerms> grad{};
     T* grad_color = grad_colors.mine();
     if (is_first)
       for (int i = 0; i < kColumns; ++i) grad_color[i] = 0;
@@ -169,7 +203,7 @@ __device__ void gather_rows(const Job<T>& job, const Slots<T>& slots, const Rast
       fetch();
       SlotSums<T> sums;
       T viewmat[12] = {};
-      if (!sum_slots(job, group, row, bounds, slot_begin, slots, sums, grads.features + row * s.n_features)) continue;
+      if (!sum_slots(job, group, row, bounds, slot_begin, slots, sums, grads.features + row * slots.n_columns)) continue;
       if (group.finished)
         project_vjp_of<T, kTerms>(view.camera, gaussian, colors.mine(), sums, grad, grad_color, viewmat), shown = true;
       else
@@ -218,8 +252,9 @@ __device__ void gather_viewmats(const Job<T>& job, const Slots<T>& slots) {
       SlotSums<T> sums;
       if (!sum_slots<T>(job, group, row, bounds, slot_begin, slots, sums, nullptr)) continue;
       RowGrad<T> unused{};
-      project_vjp_of<T, kTerms>(view.camera, Gaussian<T>(s, row), s.color + row * kColumns, sums, unused,
-                                static_cast<T*>(nullptr), viewmat);
+      if constexpr (kTerms != kProjected)
+        project_vjp_of<T, kTerms>(view.camera, Gaussian<T>(s, row), s.color + row * kColumns, sums, unused,
+                                  static_cast<T*>(nullptr), viewmat);
     }
     reduce_block(viewmat, shared);
     if (threadIdx.x == 0)

@@ -146,6 +146,7 @@ __device__ bool go_on(const Job<T>& first, const Job<T>& job) {
 template <typename T>
 __device__ void project_any(const Job<T>& job) {
   switch (job.scene.sh_terms) {
+    case kProjected: return project_rows<T, kProjected>(job, dynamic_memory);
     case 0: return project_rows<T, 0>(job, dynamic_memory);
     case 1: return project_rows<T, 1>(job, dynamic_memory);
     case 4: return project_rows<T, 4>(job, dynamic_memory);

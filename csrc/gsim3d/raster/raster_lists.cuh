@@ -247,9 +247,12 @@ __device__ void plan(const Job<T>& job) {
     view = {};
     view.next = kNoImage;
     const int64_t cloud = s.image_cloud[i];
-    if (!good || !cuda::inside(cloud, s.n_clouds) || !camera_is_good(s.viewmats + 16 * i, s.Ks + 9 * i)) continue;
-    view.camera = make_camera(s.viewmats + 16 * i, s.Ks + 9 * i, s.width, s.height, s.near_plane,
-                              s.jacobian == RasterJacobian::kClamped);
+    if (!good || !cuda::inside(cloud, s.n_clouds)) continue;
+    if (s.sh_terms != kProjected) {
+      if (!camera_is_good(s.viewmats + 16 * i, s.Ks + 9 * i)) continue;
+      view.camera = make_camera(s.viewmats + 16 * i, s.Ks + 9 * i, s.width, s.height, s.near_plane,
+                                s.jacobian == RasterJacobian::kClamped);
+    }
     view.row_begin = s.cu_rows[cloud], view.row_end = s.cu_rows[cloud + 1];
     atomicMin(&job.clouds[cloud].first, static_cast<int32_t>(i));
   }

@@ -300,7 +300,7 @@ GSIM3D_HD void view_direction_vjp(const Camera<S>& camera, const V point[3], con
   }
 }
 
-// ---- colour of real spherical harmonics, standard 3DGS basis and order, kTerms = 1, 4, 9 or 16 --------------------
+// ---- colour of real spherical harmonics, standard 3DGS basis and order, kTerms = 1, 4, 9, 16 or 25-----------------
 
 template <int kTerms, typename V>
 GSIM3D_HD void sh_basis(const V d[3], V basis[kTerms]) {
@@ -323,6 +323,16 @@ GSIM3D_HD void sh_basis(const V d[3], V basis[kTerms]) {
       basis[12] = S(0.3731763325901154) * z * (two * zz - three * xx - three * yy);
       basis[13] = -c1 * x * (four * zz - xx - yy), basis[14] = S(1.445305721320277) * z * (xx - yy);
       basis[15] = -c3 * x * (xx - three * yy);
+    }
+    if constexpr (kTerms >= 25) {
+      const S one = 1, three = 3, six = 6, seven = 7;
+      const S c1 = S(1.7701307697799304), c3 = S(0.6690465435572892), square = S(0.47308734787878004);
+      basis[16] = S(2.5033429417967046) * x * y * (xx - yy), basis[17] = -c1 * y * z * (three * xx - yy);
+      basis[18] = two * square * x * y * (seven * zz - one), basis[19] = -c3 * y * z * (seven * zz - three);
+      basis[20] = S(0.10578554691520431) * (zz * (S(35) * zz - S(30)) + three);
+      basis[21] = -c3 * x * z * (seven * zz - three), basis[22] = square * (xx - yy) * (seven * zz - one);
+      basis[23] = -c1 * x * z * (xx - three * yy);
+      basis[24] = S(0.6258357354491761) * (xx * (xx - six * yy) + yy * yy);
     }
   }
 }
@@ -353,6 +363,21 @@ GSIM3D_HD void sh_basis_vjp(const V d[3], const V g[kTerms], V grad_d[3]) {
       gy += -c4 * six * y * z * g[12] + c1 * cross * g[13] - c6 * two * y * z * g[14];
       gz += c5 * x * y * g[10] - c1 * eight * z * (y * g[11] + x * g[13]);
       gz += c4 * three * (two * zz - xx - yy) * g[12] + c6 * (xx - yy) * g[14];
+    }
+    if constexpr (kTerms >= 25) {
+      const S one = 1, three = 3, four = 4, six = 6, seven = 7, twelve = 12;
+      const S c0 = S(2.5033429417967046), c1 = S(1.7701307697799304), c3 = S(0.6690465435572892);
+      const S square = S(0.47308734787878004), c8 = S(0.6258357354491761);
+      const V belt = seven * zz - one, rim = seven * zz - three, end = S(21) * zz - three, xyz = x * y * z;
+      gx += c0 * y * (three * xx - yy) * g[16] - six * c1 * xyz * g[17] + two * square * y * belt * g[18];
+      gx += -c3 * z * rim * g[21] + two * square * x * belt * g[22] - three * c1 * z * (xx - yy) * g[23];
+      gx += c8 * x * (four * xx - twelve * yy) * g[24];
+      gy += c0 * x * (xx - three * yy) * g[16] - three * c1 * z * (xx - yy) * g[17] + two * square * x * belt * g[18];
+      gy += -c3 * z * rim * g[19] - two * square * y * belt * g[22] + six * c1 * xyz * g[23];
+      gy += c8 * y * (four * yy - twelve * xx) * g[24];
+      gz += -c1 * y * (three * xx - yy) * g[17] + S(28) * square * xyz * g[18] - c3 * y * end * g[19];
+      gz += S(0.10578554691520431) * z * (S(140) * zz - S(60)) * g[20] - c3 * x * end * g[21];
+      gz += S(14) * square * z * (xx - yy) * g[22] - c1 * x * (xx - three * yy) * g[23];
     }
   }
   grad_d[0] = gx, grad_d[1] = gy, grad_d[2] = gz;
@@ -415,6 +440,41 @@ GSIM3D_HD void footprint_vjp(const Footprint<V>& shape, const Moments<V>& sums, 
   grad.xx = half * a * a * sums.uu;
   grad.xy = a * b * sums.uy - a * c * sums.uu;
   grad.yy = half * (b * b * sums.yy + c * c * sums.uu) - b * c * sums.uy;
+}
+
+// ---- a Gaussian that is projected already: its conic (a, b, c) is Sigma^-1 ------------------------------------------
+
+template <typename V>
+GSIM3D_HD bool conic_is_good(V a, V b, V c) {
+  return usable(a) && usable(b) && usable(c) && a > V{} && a * c - b * b > V{};
+}
+
+template <typename V>
+GSIM3D_HD Footprint<V> footprint_of_conic(V a, V b, V c) {
+  return {-b / a, a, (a * c - b * b) / a};
+}
+
+template <typename V>
+struct Covariance {
+  V xx, yy, determinant;
+};
+
+template <typename V>
+GSIM3D_HD Covariance<V> covariance_of_conic(V a, V b, V c) {
+  const V inverse = Lanes<V>::splat(1) / (a * c - b * b);
+  return {c * inverse, a * inverse, inverse};
+}
+
+// The exponent is -(a dx^2 + 2 b dx dy + c dy^2) / 2, dx = u + slope dy, and (dx, dy) falls with the mean.
+template <typename V>
+GSIM3D_HD void conic_vjp(const Footprint<V>& shape, const Moments<V>& sums, V grad_mean[2], V grad_conic[3]) {
+  using S = ScalarOf<V>;
+  const V a = shape.tight, b = shape.loose, c = shape.slope * shape.tight, slope = shape.slope;
+  grad_mean[0] = a * sums.u;
+  grad_mean[1] = b * sums.y - c * sums.u;
+  grad_conic[0] = S(-0.5) * (sums.uu + slope * (S(2) * sums.uy + slope * sums.yy));
+  grad_conic[1] = -(sums.uy + slope * sums.yy);
+  grad_conic[2] = S(-0.5) * sums.yy;
 }
 
 // ---- pixels that may see a Gaussian; V is a scalar here -------------------------------------------------------------

@@ -1,6 +1,8 @@
 // Inside of the CUDA rasterizer: records of all pairs, and the number of entries of every tile.
 #pragma once
 
+#include <type_traits>
+
 #include "gsim3d/raster/raster_walk.cuh"
 
 namespace gsim3d::raster {
@@ -25,6 +27,44 @@ struct Gaussian {
     return good;
   }
 };
+
+// One that is projected already.
+template <typename T>
+struct FlatGaussian {
+  T mean[2], conic[3], depth, opacity;
+
+  __device__ FlatGaussian(const RasterScene<T>& s, int64_t row) {
+    for (int i = 0; i < 2; ++i) mean[i] = s.means2d[2 * row + i];
+    for (int i = 0; i < 3; ++i) conic[i] = s.conics[3 * row + i];
+    depth = s.depths[row], opacity = s.opacities[row];
+  }
+
+  __device__ bool is_good() const {
+    return opacity >= 0 && opacity <= 1 && usable(mean[0]) && usable(mean[1]) && usable(depth) && depth > 0 &&
+           conic_is_good(conic[0], conic[1], conic[2]);
+  }
+};
+
+template <typename T, int kTerms>
+using GaussianOf = std::conditional_t<kTerms == kProjected, FlatGaussian<T>, Gaussian<T>>;
+
+template <typename T, int kTerms>
+__device__ PixelRect make_record(const RasterScene<T>& s, const Camera<T>&, const FlatGaussian<T>& gaussian, T level,
+                                 T strength, const T* color, Record<T>& record) {
+  const T *mean = gaussian.mean, *conic = gaussian.conic;
+  const Covariance<T> covariance = covariance_of_conic(conic[0], conic[1], conic[2]);
+  const Footprint<T> shape = footprint_of_conic(conic[0], conic[1], conic[2]);
+  if (!isfinite(covariance.determinant) || !(shape.loose > 0)) return {};
+  const PixelRect bounds = pixel_bounds(mean[0], mean[1], covariance.xx, covariance.yy, covariance.determinant, level,
+                                        s.width, s.height, false);
+  if (bounds.x0 >= bounds.x1) return {};
+  record.x = mean[0], record.y = mean[1], record.z = gaussian.depth, record.slope = shape.slope;
+  record.tight = fast_sqrt(shape.tight * T(kLog2eHalf)), record.loose = fast_sqrt(shape.loose * T(kLog2eHalf));
+  record.strength = strength;
+  record.x0 = bounds.x0, record.x1 = bounds.x1, record.y0 = bounds.y0, record.y1 = bounds.y1;
+  record.red = color[0], record.green = color[1], record.blue = color[2];
+  return bounds;
+}
 
 // Empty bounds where the Gaussian is not seen; the record is then unset. The CPU refuses rows that are not good; here
 // they are left out.
@@ -111,7 +151,7 @@ __device__ void project_rows(const Job<T>& job, unsigned char* memory) {
     colors.load(s.color + rows.begin * kColumns, rows.count);
     const T* coefficients = colors.mine();
     const int64_t row = rows.inside ? rows.row : rows.begin;
-    const Gaussian<T> gaussian(s, row);
+    const GaussianOf<T, kTerms> gaussian(s, row);
     bool good = rows.inside && gaussian.is_good();
     for (int i = 0; i < kColumns && good; ++i) good &= usable(coefficients[i]);
     for (int64_t i = 0; i < s.n_features; ++i) good &= usable(s.features[row * s.n_features + i]);

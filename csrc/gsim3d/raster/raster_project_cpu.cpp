@@ -103,6 +103,30 @@ Unusable project_chunk(const RasterScene<T>& scene, const Camera<T>& camera, con
   return unusable;
 }
 
+// Splats of rows that are projected already.
+template <typename T>
+void read_chunk(const RasterScene<T>& scene, const Chunk& chunk, Splat<T>* splats) {
+  const T log2e_half = T(kLog2eHalf);
+  for (int64_t row = chunk.begin; row < chunk.end; ++row) {
+    Splat<T>& splat = splats[row - chunk.begin];
+    splat.bounds = {};
+    const T *mean = scene.means2d + 2 * row, *conic = scene.conics + 3 * row, *color = scene.color + 3 * row;
+    const T z = scene.depths[row], opacity = scene.opacities[row];
+    if (!conic_is_good(conic[0], conic[1], conic[2]) || !all_usable(mean, 2) || !usable(z) || !(z > 0)) continue;
+    if (!(opacity >= T(kMinAlpha) && opacity <= 1) || !all_usable(color, 3)) continue;
+    if (!all_usable(scene.features + row * scene.n_features, scene.n_features)) continue;
+    const Footprint<T> shape = footprint_of_conic(conic[0], conic[1], conic[2]);
+    const Covariance<T> covariance = covariance_of_conic(conic[0], conic[1], conic[2]);
+    if (!std::isfinite(covariance.determinant) || !(shape.loose > 0)) continue;
+    splat.x = mean[0], splat.y = mean[1], splat.z = z;
+    splat.slope = shape.slope, splat.tight = shape.tight * log2e_half, splat.loose = shape.loose * log2e_half;
+    splat.opacity = opacity, splat.level = level_of(opacity);
+    for (int c = 0; c < 3; ++c) splat.color[c] = color[c];
+    splat.bounds = pixel_bounds(splat.x, splat.y, covariance.xx, covariance.yy, covariance.determinant, splat.level,
+                                scene.width, scene.height, false);
+  }
+}
+
 // Calls f(tile) for every tile with a pixel that may see the splat, row by row. A row of tiles is cut to the columns
 // between the leftmost and the rightmost point of the ellipse within it.
 template <typename T, typename F>
@@ -152,8 +176,11 @@ void choose_images(const RasterScene<T>& scene, Group<T>& group) {
       group.chunks.push_back({image, row, std::min(end, row + rows_per_chunk), pairs + row - begin});
     group.image_pair.push_back(pairs + end - begin);
     group.image_chunk.push_back(static_cast<int64_t>(group.chunks.size()));
-    group.cameras.push_back(make_camera(scene.viewmats + 16 * image, scene.Ks + 9 * image, scene.width, scene.height,
-                                        scene.near_plane, scene.jacobian == RasterJacobian::kClamped));
+    if (scene.sh_terms == kProjected)
+      group.cameras.emplace_back();
+    else
+      group.cameras.push_back(make_camera(scene.viewmats + 16 * image, scene.Ks + 9 * image, scene.width, scene.height,
+                                          scene.near_plane, scene.jacobian == RasterJacobian::kClamped));
     group.last = image + 1;
   }
 }
@@ -187,8 +214,11 @@ bool next_group(const RasterScene<T>& scene, bool backward, Scratch& scratch, co
     const Chunk& chunk = group.chunks[c];
     Splat<T>* splats = group.splats + chunk.pair;
     dispatch_sh(scene.sh_terms, [&](auto terms) {
-      unusable[c] = project_chunk<T, decltype(terms)::value>(scene, group.cameras[chunk.image - group.first], chunk,
-                                                             splats);
+      constexpr int kTerms = decltype(terms)::value;
+      if constexpr (kTerms == kProjected)
+        read_chunk(scene, chunk, splats);
+      else
+        unusable[c] = project_chunk<T, kTerms>(scene, group.cameras[chunk.image - group.first], chunk, splats);
     });
     int64_t* counts = group.cursor + c * n_tiles;
     std::fill_n(counts, n_tiles, int64_t{0});

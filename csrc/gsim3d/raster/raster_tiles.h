@@ -137,15 +137,16 @@ template <typename T>
 void blend_group(const RasterScene<T>& scene, const Group<T>& group, const RasterImages<T>& images,
                  const Parallel& parallel);
 
-// Gradients of one instance: Moments (5), sum v, colour (3), depth, features.
+// Gradients of one instance: Moments (5), sum v, colour (3), depth, features, and two of |mean| where they are wanted.
 constexpr int kSlotFixed = 10;
 
 // Writes the gradients of every instance to its slot, and adds those of the background.
 template <typename T>
 void blend_group_vjp(const RasterScene<T>& scene, const Group<T>& group, const RasterImageGrads<T>& image_grads,
-                     T* slots,            // [n_instances, kSlotFixed + n_features]
+                     T* slots,            // [n_instances, kSlotFixed + feature columns]
                      T* tile_background,  // [images * tiles, 3] scratch
                      T* grad_background,  // [n_images, 3]
+                     bool absolute,       // as of RasterSceneGrads
                      const Parallel& parallel);
 
 // Scratch slots.

@@ -115,6 +115,25 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "inverse_depths, "
       "Tensor src_images, Tensor cu_src) -> Tensor");
 
+  // projection: 3D Gaussians into images without blending them, P pairs of a row and an image; lens 0 pinhole, 1
+  // orthographic, 2 opencv, 3 fisheye. Of the gradient, what is not wanted is empty.
+  m.def(
+      "project_gaussians(Tensor means, Tensor? quats, Tensor? scales, Tensor? covars, Tensor? opacities, Tensor "
+      "viewmats, Tensor Ks, Tensor? distortion, Tensor? limits, Tensor image_cloud, Tensor cu_rows, Tensor cu_pairs, "
+      "SymInt n_pairs, int width, int height, float near_plane, float far_plane, float radius_clip, float dilation, int "
+      "lens, bool clamped, bool antialiased) -> (Tensor means2d, Tensor conics, Tensor depths, Tensor radii, Tensor "
+      "compensations)");
+  m.def(
+      "project_gaussians_backward(Tensor grad_means2d, Tensor grad_conics, Tensor grad_depths, Tensor "
+      "grad_compensations, Tensor radii, Tensor means, Tensor? quats, Tensor? scales, Tensor? covars, Tensor viewmats, "
+      "Tensor Ks, Tensor? distortion, Tensor image_cloud, Tensor cu_rows, Tensor cu_pairs, SymInt n_pairs, int width, "
+      "int height, float dilation, int lens, bool clamped, bool viewmats_grad, bool lens_grad) -> (Tensor means, Tensor "
+      "quats, Tensor scales, Tensor covars, Tensor viewmats, Tensor Ks, Tensor distortion)");
+
+  // sh_to_color: colours [B, V, N, D] of real spherical harmonics [B, N, K, D] seen along directions [B, V, N, 3].
+  m.def("sh_to_color(Tensor directions, Tensor sh) -> Tensor");
+  m.def("sh_to_color_backward(Tensor grad, Tensor directions, Tensor sh) -> (Tensor directions, Tensor sh)");
+
   // raster: 3D Gaussian projection and blending. color is [N, K, 3] SH coefficients or [N, 3]; cutoff 0 exact, 1
   // tile3sigma, 2 smooth; jacobian 0 exact, 1 clamped; transmittance, last and state are kept for the backward pass.
   // max_* (CUDA) size the state.
@@ -134,6 +153,20 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "int width, int height, float near_plane, int cutoff, int jacobian, SymInt max_pairs, SymInt max_entries, SymInt "
       "max_slots, bool viewmats_grad) -> (Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor color, "
       "Tensor features, Tensor background, Tensor viewmats)");
+
+  // The same blending of Gaussians that are projected already, each for one image. The gradient of `absolute` [P, 2] is
+  // the sum over pixels of |gradient of means2d|; it takes no other part, and is two more columns of features.
+  m.def(
+      "rasterize_projected(Tensor means2d, Tensor conics, Tensor depths, Tensor opacities, Tensor color, Tensor "
+      "features, Tensor background, Tensor? absolute, Tensor image_cloud, Tensor cu_rows, int width, int height, int "
+      "cutoff, SymInt max_pairs, SymInt max_entries, SymInt max_slots) -> (Tensor color, Tensor alpha, Tensor depth, "
+      "Tensor features, Tensor transmittance, Tensor last, Tensor state)");
+  m.def(
+      "rasterize_projected_backward(Tensor grad_color, Tensor grad_alpha, Tensor grad_depth, Tensor grad_features, "
+      "Tensor transmittance, Tensor last, Tensor state, Tensor means2d, Tensor conics, Tensor depths, Tensor opacities, "
+      "Tensor color, Tensor features, Tensor background, Tensor image_cloud, Tensor cu_rows, int width, int height, int "
+      "cutoff, SymInt max_pairs, SymInt max_entries, SymInt max_slots, bool absolute) -> (Tensor means2d, Tensor "
+      "conics, Tensor depths, Tensor opacities, Tensor color, Tensor features, Tensor background)");
 }
 
 // The library is loaded by importing it; its contents are the registered ops.

@@ -1,0 +1,306 @@
+"""gsplat's call on this project's kernels: ``from gsim3d.compat.gsplat import rasterization``.
+
+The signature, shapes and conventions of gsplat 1.6.0's ``rasterization`` for 3D Gaussian splatting, on CPU and CUDA,
+with equal bits from run to run.
+"""
+
+from __future__ import annotations
+
+import math
+import weakref
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsim3d.cameras import Cameras
+from gsim3d.errors import InputError
+from gsim3d.ops.projection import Projection, project_gaussians, sh_to_color
+from gsim3d.ops.raster import Rendering
+from gsim3d.ops.raster_projected import rasterize_projected
+
+LENSES = {"pinhole": "pinhole", "ortho": "orthographic", "fisheye": "fisheye"}
+RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+RASTERIZE_MODES = ("classic", "antialiased")
+NO_TILES = ("tiles_per_gauss", "isect_ids", "flatten_ids", "isect_offsets", "tile_width", "tile_height")
+
+
+class Meta(dict):
+    """What :func:`rasterization` knows of every Gaussian in every image; lists of tiles are refused by name."""
+
+    def __missing__(self, key: str) -> Any:
+        if key in NO_TILES:
+            raise InputError(
+                f"rasterization: meta[{key!r}] is not kept: lists of tiles are made inside of the kernel, in a form of "
+                "its own; read radii, means2d, conics and depths"
+            )
+        raise KeyError(key)
+
+
+def rasterization(
+    means: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    opacities: Tensor,
+    colors: Tensor | None,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    packed: bool = True,
+    tile_size: int | None = None,
+    backgrounds: Tensor | None = None,
+    render_mode: str = "RGB",
+    sparse_grad: bool = False,
+    absgrad: bool = False,
+    rasterize_mode: str = "classic",
+    channel_chunk: int = 32,
+    distributed: bool = False,
+    camera_model: str = "pinhole",
+    segmented: bool = False,
+    covars: Tensor | None = None,
+    with_ut: bool = False,
+    with_eval3d: bool = False,
+    return_normals: bool = False,
+    global_z_order: bool = True,
+    rays: Tensor | None = None,
+    radial_coeffs: Tensor | None = None,
+    tangential_coeffs: Tensor | None = None,
+    thin_prism_coeffs: Tensor | None = None,
+    ftheta_coeffs: Any = None,
+    lidar_coeffs: Any = None,
+    external_distortion_coeffs: Any = None,
+    rolling_shutter: Any = None,
+    viewmats_rs: Tensor | None = None,
+    ut_params: Any = None,
+    extra_signals: Tensor | None = None,
+    extra_signals_sh_degree: int | None = None,
+    renderer_config: Any = None,
+) -> tuple[Tensor, Tensor, Meta]:
+    """Renders 3D Gaussians as gsplat does.
+
+    Sizes: leading batch dimensions ``...``, C cameras, N Gaussians, D channels, K coefficients.
+
+    Args:
+        means: [..., N, 3] metres; float32 or float64, the dtype of all others.
+        quats: [..., N, 4] (w, x, y, z), of any length.
+        scales: [..., N, 3] metres, standard deviations.
+        opacities: [..., N] in [0, 1].
+        colors: [..., N, D] or [..., C, N, D]; with ``sh_degree`` [N, K, D] or [..., N, K, D] coefficients; also float16.
+            None where ``render_mode`` has no colour.
+        viewmats: [..., C, 4, 4] world to camera.
+        Ks: [..., C, 3, 3] pixels.
+        width, height: pixels.
+        near_plane, far_plane: metres of camera z.
+        radius_clip: pixels; Gaussians whose radii are both at most this are left out.
+        eps2d: px^2, added to both variances.
+        sh_degree: 0 to 4, of the coefficients that are used.
+        packed: ``meta`` has a row for each Gaussian that is seen; on a GPU counting them waits for it.
+        backgrounds: [..., C, D]; black where there are none.
+        render_mode: "RGB", "D", "ED", "RGB+D" or "RGB+ED".
+        absgrad: after the backward pass ``meta["means2d"].absgrad`` holds the sum over pixels of the absolute gradients.
+        rasterize_mode: "classic", or "antialiased": opacities are multiplied by Mip-Splatting's compensation.
+        camera_model: "pinhole", "ortho" or "fisheye".
+        covars: [..., N, 3, 3] m^2, in place of ``quats`` and ``scales``.
+        radial_coeffs: [..., C, 6] k1 to k6 of OpenCV's pinhole, or [..., C, 4] k1 to k4 of its fisheye.
+        tangential_coeffs: [..., C, 2] p1, p2 of OpenCV's pinhole.
+        tile_size, channel_chunk, segmented: of gsplat's kernels; they change no result here.
+        sparse_grad, distributed, with_ut, with_eval3d, return_normals, global_z_order, rays, thin_prism_coeffs,
+            ftheta_coeffs, lidar_coeffs, external_distortion_coeffs, rolling_shutter, viewmats_rs, ut_params,
+            extra_signals, extra_signals_sh_degree, renderer_config: not offered; any but the default raises.
+    Returns:
+        Images [..., C, height, width, D (+ 1)], depth last; alpha [..., C, height, width, 1]; ``meta`` with "means2d"
+        [..., C, N, 2], "radii" int32 [..., C, N, 2], "depths" and "opacities" [..., C, N], "conics" [..., C, N, 3], and
+        None for "batch_ids", "camera_ids" and "gaussian_ids"; packed: [nnz, ...] and int64 ids. Also "width",
+        "height", "tile_size", "n_batches" and "n_cameras".
+    Gradients:
+        means, quats, scales, covars, opacities, colors, viewmats, backgrounds; unlike there also Ks and the
+        coefficients. ``meta["means2d"]`` carries the gradient of the images.
+    Raises:
+        InputError: an argument or a value that is not offered, or a list of tiles read from ``meta``.
+        ValueError, TypeError: a shape or dtype is not as above.
+    """
+    offered = {
+        "sparse_grad": sparse_grad, "distributed": distributed, "with_ut": with_ut, "with_eval3d": with_eval3d,
+        "return_normals": return_normals, "global_z_order": not global_z_order, "rays": rays,
+        "thin_prism_coeffs": thin_prism_coeffs, "ftheta_coeffs": ftheta_coeffs, "lidar_coeffs": lidar_coeffs,
+        "external_distortion_coeffs": external_distortion_coeffs, "viewmats_rs": viewmats_rs, "ut_params": ut_params,
+        "rolling_shutter": None if getattr(rolling_shutter, "name", "") == "GLOBAL" else rolling_shutter,
+        "extra_signals": extra_signals, "extra_signals_sh_degree": extra_signals_sh_degree,
+        "renderer_config": renderer_config,
+    }  # fmt: skip
+    _refuse(offered, {"camera_model": (camera_model, LENSES), "render_mode": (render_mode, RENDER_MODES),
+                      "rasterize_mode": (rasterize_mode, RASTERIZE_MODES)})  # fmt: skip
+    with_color, with_depth = "RGB" in render_mode, "D" in render_mode.removeprefix("RGB")
+    batch, n, n_cameras = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
+    _check(batch, n, n_cameras, means, quats, scales, covars, opacities, viewmats, Ks)
+    n_batches = math.prod(batch)
+    n_images = n_batches * n_cameras
+    antialiased = rasterize_mode == "antialiased"
+
+    lens, distortion = _lens(LENSES[camera_model], radial_coeffs, tangential_coeffs, n_images)
+    image_cloud = torch.arange(n_batches, device=means.device).repeat_interleave(n_cameras, output_size=n_images)
+    no_plane = means.new_zeros(n_images)
+    cameras = Cameras(
+        viewmats.reshape(-1, 4, 4), Ks.reshape(-1, 3, 3), no_plane, no_plane, image_cloud, width, height
+    )
+    shapes = (None, None) if covars is not None else (quats.reshape(-1, 4), scales.reshape(-1, 3))
+    projection = project_gaussians(
+        means.reshape(-1, 3),
+        *shapes,
+        cameras,
+        covars=None if covars is None else covars.reshape(-1, 3, 3),
+        opacities=opacities.reshape(-1),
+        lens=lens,
+        distortion=distortion,
+        cu_rows=torch.arange(n_batches + 1, device=means.device) * n,
+        n_pairs=n_images * n,
+        near_plane=near_plane,
+        far_plane=far_plane,
+        radius_clip=radius_clip,
+        dilation=eps2d,
+        jacobian="clamped",
+        antialiased=antialiased,
+    )
+    values = means.new_zeros(n_images * n, 0)
+    if with_color:
+        values = _colors(colors, sh_degree, means, viewmats).reshape(n_images * n, -1)
+    of_images = opacities[..., None, :].expand(*batch, n_cameras, n).reshape(-1)
+    alphas = of_images * projection.compensations if antialiased else of_images
+    rows = (*projection[:4], alphas, values)
+    meta, cu_pairs = Meta(batch_ids=None, camera_ids=None, gaussian_ids=None), projection.cu_pairs
+    sizes = (*batch, n_cameras, n)
+    if packed:
+        rows, cu_pairs, ids = _seen(rows, projection, n, n_cameras)
+        meta |= ids
+        sizes = (rows[0].shape[0],)
+    # The 2D means as they are in meta are what is blended, so that they get a gradient.
+    rows = tuple(row.reshape(*sizes, *row.shape[1:]) for row in rows)
+    means2d, conics, depths, radii, alphas, values = rows
+    meta |= {"radii": radii, "means2d": means2d, "depths": depths, "conics": conics, "opacities": alphas}
+    meta |= {"width": width, "height": height, "tile_size": 16 if tile_size is None else tile_size}
+    meta |= {"n_batches": n_batches, "n_cameras": n_cameras}
+    flat = [row.reshape(-1, *row.shape[len(sizes) :]) for row in (means2d, conics, depths, alphas, values)]
+    if backgrounds is not None:
+        backgrounds = backgrounds.reshape(n_images, -1) if with_color else None
+    absolute = _absolute(means2d) if absgrad and means2d.requires_grad else None
+    image = rasterize_projected(
+        *flat, width=width, height=height, cu_pairs=cu_pairs, background=backgrounds, absolute=absolute
+    )
+    color, alpha = _images(image, render_mode if with_depth else "RGB", (*batch, n_cameras))
+    return color, alpha, meta
+
+
+def _refuse(offered: dict[str, Any], choices: dict[str, tuple[str, Sequence[str]]]) -> None:
+    for name, value in offered.items():
+        if value is not None and value is not False:
+            raise InputError(f"rasterization: {name} is not offered; leave it at its default")
+    for name, (value, known) in choices.items():
+        if value not in known:
+            raise InputError(f"rasterization: {name} must be one of {', '.join(known)}; got {value!r}")
+
+
+def _check(batch, n, n_cameras, means, quats, scales, covars, opacities, viewmats, Ks) -> None:
+    shapes = {"means": (means, (n, 3)), "opacities": (opacities, (n,))}
+    shapes |= {"viewmats": (viewmats, (n_cameras, 4, 4)), "Ks": (Ks, (n_cameras, 3, 3))}
+    if covars is None:
+        shapes |= {"quats": (quats, (n, 4)), "scales": (scales, (n, 3))}
+    else:
+        shapes["covars"] = (covars, (n, 3, 3))
+    for name, (value, shape) in shapes.items():
+        if value is None or value.shape != (*batch, *shape):
+            got = None if value is None else list(value.shape)
+            raise ValueError(f"rasterization: {name} must be {[*batch, *shape]}; got {got}")
+
+
+def _lens(lens: str, radial: Tensor | None, tangential: Tensor | None, n_images: int) -> tuple[str, Tensor | None]:
+    """The lens, and its coefficients in OpenCV's order."""
+    if radial is None and tangential is None:
+        return lens, None
+    if lens == "fisheye" and tangential is None:
+        return lens, radial.reshape(n_images, -1)
+    if lens != "pinhole":
+        raise InputError(
+            "rasterization: radial_coeffs are of camera_model pinhole and fisheye, tangential_coeffs of pinhole"
+        )
+    like = radial if tangential is None else tangential
+    zeros = like.new_zeros(n_images, 6)
+    k = zeros if radial is None else radial.reshape(n_images, -1)
+    p = zeros[:, :2] if tangential is None else tangential.reshape(n_images, -1)
+    if k.shape[1] not in (4, 6) or p.shape[1] != 2:
+        raise ValueError(
+            "rasterization: radial_coeffs must be [..., C, 6] or [..., C, 4] and tangential_coeffs [..., C, 2]; got "
+            f"{k.shape[1]} and {p.shape[1]} of each camera"
+        )
+    return "opencv", torch.cat([k[:, :2], p, k[:, 2:], zeros[:, k.shape[1] :]], 1)
+
+
+def _colors(colors: Tensor | None, sh_degree: int | None, means: Tensor, viewmats: Tensor) -> Tensor:
+    """[..., C, N, D]."""
+    batch, n, n_cameras = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
+    if colors is None:
+        raise ValueError("rasterization: colors are needed, unless render_mode is D or ED")
+    if sh_degree is None:
+        if colors.shape[:-1] == (*batch, n):
+            colors = colors[..., None, :, :].expand(*batch, n_cameras, n, colors.shape[-1])
+        if colors.shape[:-1] != (*batch, n_cameras, n):
+            raise ValueError(
+                f"rasterization: colors must be {[*batch, n, 'D']} or {[*batch, n_cameras, n, 'D']}; got "
+                f"{list(colors.shape)}"
+            )
+        return colors
+    shared = colors.dim() == 3
+    if colors.shape[:-2] not in ((n,), (*batch, n)) or not 0 <= sh_degree <= 4 or colors.shape[-2] < (sh_degree + 1) ** 2:
+        raise ValueError(
+            f"rasterization: with sh_degree={sh_degree} (0 to 4) colors must be [N={n}, K >= (sh_degree + 1)^2, D]; got "
+            f"{list(colors.shape)}"
+        )
+    sh = colors[..., : (sh_degree + 1) ** 2, :]
+    turned, moved = viewmats[..., :3, :3], viewmats[..., :3, 3]
+    centre = -(turned.mT @ moved[..., None])[..., 0]
+    directions = means[..., None, :, :] - centre[..., None, :]
+    if shared:
+        seen = sh_to_color(directions.reshape(-1, n, 3), sh)
+    else:
+        seen = sh_to_color(directions.reshape(-1, n_cameras, n, 3), sh.reshape(-1, *sh.shape[-3:]))
+    return seen.reshape(*batch, n_cameras, n, -1)
+
+
+def _seen(rows: tuple[Tensor, ...], projection: Projection, n: int, n_cameras: int) -> tuple:
+    """Rows of the pairs that are seen, where those of each image begin, and whose they are."""
+    pairs = (projection.radii > 0).all(1).nonzero()[:, 0]
+    images = pairs // n
+    counts = torch.zeros(len(projection.cu_pairs), dtype=torch.int64, device=pairs.device)
+    cu_pairs = counts.index_add_(0, images + 1, torch.ones_like(images)).cumsum(0)
+    ids = {"batch_ids": images // n_cameras, "camera_ids": images % n_cameras, "gaussian_ids": pairs % n}
+    return tuple(row[pairs] for row in rows), cu_pairs, ids
+
+
+def _absolute(means2d: Tensor) -> Tensor:
+    """Zeros whose gradient becomes ``means2d.absgrad``."""
+    absolute = torch.zeros_like(means2d).reshape(-1, 2).requires_grad_()
+    shape, to = means2d.shape, weakref.ref(means2d)
+
+    def keep(grad: Tensor) -> None:
+        tensor = to()
+        if tensor is not None:
+            tensor.absgrad = grad.reshape(shape)
+
+    absolute.register_hook(keep)
+    return absolute
+
+
+def _images(image: Rendering, render_mode: str, sizes: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+    """Colour with depth as the last channel, and alpha."""
+    alpha, depth = image.alpha[..., None], image.depth[..., None]
+    if render_mode.endswith("ED"):
+        depth = depth / alpha.clamp_min(1e-10)
+    parts = {"RGB": [image.color], "D": [depth], "ED": [depth]}.get(render_mode, [image.color, depth])
+    color = torch.cat(parts, -1) if len(parts) > 1 else parts[0]
+    return color.reshape(*sizes, *color.shape[1:]), alpha.reshape(*sizes, *alpha.shape[1:])

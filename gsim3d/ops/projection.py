@@ -1,0 +1,326 @@
+"""Projection and colours of 3D Gaussians on their own, for programs that blend or densify by what it says."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from gsim3d.cameras import Cameras
+from gsim3d.ops._arguments import check_floating, check_numbers, check_real, check_tensors, check_whole, within_memory
+from gsim3d.ops._register import fake, register_autocast, register_gradients
+
+OP = "project_gaussians"
+LENSES = {"pinhole": 0, "orthographic": 1, "opencv": 2, "fisheye": 3}
+JACOBIANS = ("exact", "clamped")
+N_DISTORTION = {"opencv": (4, 5, 8), "fisheye": (4,)}  # numbers of coefficients that a lens may have
+LARGEST = 1e15
+
+
+class Projection(NamedTuple):
+    """Gaussians in the images of one call: P pairs of an image and a row of the cloud that it shows.
+
+    A pair that is not seen holds zeros.
+
+    Attributes:
+        means2d: [P, 2] pixels.
+        conics: [P, 3] px^-2, entries (xx, xy, yy) of the inverse covariance.
+        depths: [P] metres, camera z.
+        radii: int32 [P, 2] pixels, half the width and height within which it shows; 0 where it is not seen.
+        compensations: [P], by which an opacity is multiplied so that the dilation adds no light.
+        cu_pairs: int64 [I + 1], pairs of image i are cu_pairs[i] .. cu_pairs[i + 1], in the order of rows.
+    """
+
+    means2d: Tensor
+    conics: Tensor
+    depths: Tensor
+    radii: Tensor
+    compensations: Tensor
+    cu_pairs: Tensor
+
+
+def project_gaussians(
+    means: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    cameras: Cameras,
+    *,
+    covars: Tensor | None = None,
+    opacities: Tensor | None = None,
+    lens: str = "pinhole",
+    distortion: Tensor | None = None,
+    cu_rows: Tensor | None = None,
+    n_pairs: int | None = None,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    dilation: float = 0.3,
+    jacobian: str = "exact",
+    antialiased: bool = False,
+) -> Projection:
+    """Projects clouds of 3D Gaussians into images, for :func:`rasterize_projected`.
+
+    A Gaussian's mean goes through the lens; its covariance through the lens's exact derivative J there, as
+    ``J W R S S R^T W^T J^T + dilation I``. A pair of a Gaussian and an image is not seen where the mean is outside of
+    (near_plane, far_plane) or beyond the radius at which the lens folds back, where its opacity is below 1/255, both
+    radii are at most ``radius_clip`` or its bounds are outside of the image.
+
+    Args:
+        means: [N, 3] metres; float32 or float64, the dtype of all others.
+        quats: [N, 4] (w, x, y, z), normalised inside; None with ``covars``.
+        scales: [N, 3] metres, standard deviations, not negative; None with ``covars``.
+        cameras: I images; ``near`` and ``far`` are not read.
+        covars: [N, 3, 3] m^2, symmetric, in place of ``quats`` and ``scales``; the upper half is read.
+        opacities: [N] in [0, 1]; with them radii end where alpha falls below 1/255. They get no gradient.
+        lens: "pinhole"; "orthographic": pixels are focal lengths times metres; "opencv": OpenCV's polynomial model;
+            "fisheye": OpenCV's equidistant one.
+        distortion: [I, 4, 5 or 8] k1, k2, p1, p2, k3, k4, k5, k6 of "opencv", [I, 4] k1 to k4 of "fisheye"; None: 0.
+        cu_rows: int64 [Q + 1], rows of cloud q are cu_rows[q] .. cu_rows[q + 1]; default one cloud.
+        n_pairs: P; counted where it is not given, so on a GPU it is needed beside ``cu_rows``.
+        near_plane, far_plane: metres of camera z.
+        radius_clip: pixels.
+        dilation: px^2, added to both variances.
+        jacobian: as of :func:`rasterize_gaussians`, for pinholes.
+        antialiased: the opacities will be multiplied by the compensation (Mip-Splatting): it counts for the radii.
+    Returns:
+        Projection, dtype of ``means``.
+    Gradients:
+        means, quats, scales or covars (symmetric), ``cameras.viewmats`` (its 12 upper entries taken as free numbers),
+        ``cameras.Ks`` (focal lengths, skew, principal point) and distortion; once.
+    Determinism:
+        equal bits for any number of threads; on a GPU from run to run, and nothing waits for the device.
+    Raises:
+        NumericalError: a number is not finite or beyond 1e15; CPU only. On a GPU such a row is not seen.
+        ValueError, TypeError: an argument is malformed; the message names it.
+    Source:
+        Zwicker et al. 2002 (EWA splatting), Yu et al. 2024 (Mip-Splatting), OpenCV's camera models; conventions of
+        gsplat.
+
+    Example:
+        >>> from gsim3d.cameras import Cameras
+        >>> K = torch.tensor([[[8.0, 0.0, 4.0], [0.0, 8.0, 4.0], [0.0, 0.0, 1.0]]])
+        >>> one, first = torch.ones(1), torch.zeros(1, dtype=torch.int64)
+        >>> cameras = Cameras(torch.eye(4)[None], K, 0.1 * one, 10 * one, first, width=8, height=8)
+        >>> covars = 0.04 * torch.eye(3)[None]
+        >>> seen = project_gaussians(torch.tensor([[0.5, 0.0, 2.0]]), None, None, cameras, covars=covars)
+        >>> seen.means2d, seen.radii
+        (tensor([[6., 4.]]), tensor([[4, 4]], dtype=torch.int32))
+    """
+    given = {"quats": quats, "scales": scales, "covars": covars, "opacities": opacities, "distortion": distortion}
+    tensors = {"means": means} | {name: value for name, value in given.items() if value is not None}
+    _check(tensors, cameras, cu_rows, lens, jacobian)
+    check_real(OP, near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, dilation=dilation)
+    n, n_images = means.shape[0], cameras.viewmats.shape[0]
+    if cu_rows is None:
+        cu_rows = torch.tensor([0, n], device=means.device)
+        n_pairs = n * n_images
+    counts = (cu_rows[1:] - cu_rows[:-1])[cameras.image_cloud]
+    cu_pairs = F.pad(counts.cumsum(0), (1, 0))
+    if n_pairs is None:
+        if means.device.type != "cpu":
+            raise ValueError(f"{OP}: n_pairs is needed beside cu_rows on a GPU, where counting would wait for it")
+        n_pairs = int(cu_pairs[-1])
+    check_whole(OP, n_pairs=n_pairs)
+    limits = None
+    if distortion is not None:
+        limits = lens_limits(lens, distortion).to(means.dtype)
+        distortion = F.pad(distortion, (0, 8 - distortion.shape[1]))
+    args = (
+        *(means, quats, scales, covars, None if opacities is None else opacities.detach()),
+        *(cameras.viewmats.to(means.dtype), cameras.Ks.to(means.dtype), distortion, limits),
+        *(cameras.image_cloud, cu_rows, cu_pairs, n_pairs, cameras.width, cameras.height),
+        *(near_plane, far_plane, radius_clip, dilation, LENSES[lens], jacobian == "clamped", antialiased),
+    )
+    return Projection(*within_memory(OP, f"n_pairs={n_pairs}", torch.ops.gsim3d.project_gaussians, *args), cu_pairs)
+
+
+def lens_limits(lens: str, distortion: Tensor) -> Tensor:
+    """The largest radius up to which a lens does not fold back, found on 512 steps and then by bisection.
+
+    Args:
+        lens: "opencv" or "fisheye".
+        distortion: [I, D], as of :func:`project_gaussians`; tangential terms do not count.
+    Returns:
+        float64 [I]: tangent ("opencv") or angle in radians ("fisheye"); infinite where it never does.
+    """
+    k = F.pad(distortion.detach().double(), (0, 8 - distortion.shape[1])).unbind(1)
+    steps = torch.arange(513, device=distortion.device, dtype=torch.float64) / 512
+    grid = steps * math.pi if lens == "fisheye" else (steps * (math.pi / 2 - 1e-2)).tan()
+
+    def folds(r: Tensor) -> Tensor:
+        """bool [I, S] at radii [I, S]."""
+        r2 = r * r
+        if lens == "fisheye":
+            return 1 + sum((2 * n + 3) * k[n][:, None] * r2 ** (n + 1) for n in range(4)) <= 0
+        up, down = ((k[0], k[1], k[4]), (k[5], k[6], k[7]))
+        value, slope = (1 + sum(f(n) * up[n][:, None] * r2 ** (n + 1) for n in range(3)) for f in (_one, _odd))
+        below = 1 + sum(down[n][:, None] * r2 ** (n + 1) for n in range(3))
+        descent = sum((2 * n + 2) * down[n][:, None] * r2 ** (n + 1) for n in range(3))
+        return (below <= 0) | (slope * below - value * descent <= 0)
+
+    bad = folds(grid.expand(len(distortion), -1))
+    first = bad.int().argmax(1)
+    low, high = grid[(first - 1).clamp_min(0)], grid[first]
+    for _ in range(40):
+        middle = (low + high) / 2
+        at = folds(middle[:, None])[:, 0]
+        low, high = torch.where(at, low, middle), torch.where(at, middle, high)
+    return torch.where(bad.any(1), low, math.inf)
+
+
+def _one(n: int) -> int:
+    return 1
+
+
+def _odd(n: int) -> int:
+    return 2 * n + 3
+
+
+def sh_to_color(directions: Tensor, sh: Tensor) -> Tensor:
+    """Colours of real spherical harmonics seen along directions, ``max(0, 0.5 + sum_k basis_k sh_k)``.
+
+    Args:
+        directions: [N, 3], [V, N, 3] or [B, V, N, 3] of any length, from the camera to the Gaussian; float32 or
+            float64.
+        sh: [N, K, D], or [B, N, K, D] beside B; K = 1, 4, 9, 16 or 25 coefficients (degree 0 to 4) in the standard 3DGS
+            basis and order, D channels. float16 and bfloat16 are computed in the dtype of ``directions``.
+    Returns:
+        [..., N, D], leading sizes and dtype of ``directions``: views of one row share its coefficients, which are not
+        copied.
+    Gradients:
+        directions and sh, once; none where a colour was clamped at 0.
+    Determinism:
+        equal bits for any number of threads.
+    Raises:
+        NumericalError: a number is not finite or beyond 1e15; CPU only.
+        ValueError, TypeError: an argument is malformed; the message names it.
+    Source:
+        Sloan 2013, Efficient spherical harmonic evaluation; signs and order of 3DGS.
+
+    Example:
+        >>> sh_to_color(torch.tensor([[0.0, 0.0, 1.0]]), torch.ones(1, 1, 3)).round(decimals=3)
+        tensor([[0.7820, 0.7820, 0.7820]])
+    """
+    check_tensors("sh_to_color", directions=directions, sh=sh)
+    check_floating("sh_to_color", directions=directions)
+    if not 2 <= directions.dim() <= 4 or sh.dim() != (4 if directions.dim() == 4 else 3):
+        raise ValueError(
+            "sh_to_color: directions must be [N, 3] or [V, N, 3] with sh [N, K, D], or [B, V, N, 3] with sh "
+            f"[B, N, K, D]; got {list(directions.shape)} and {list(sh.shape)}"
+        )
+    check_numbers("sh_to_color", largest_of=LARGEST, directions=directions, sh=sh)
+    seen = directions[(None,) * (4 - directions.dim())]
+    of_rows = sh[(None,) * (4 - sh.dim())].to(directions.dtype)
+    return torch.ops.gsim3d.sh_to_color(seen, of_rows).reshape(*directions.shape[:-1], sh.shape[-1])
+
+
+def _check(tensors: dict, cameras: Cameras, cu_rows: Tensor | None, lens: str, jacobian: str) -> None:
+    if not isinstance(cameras, Cameras):
+        raise TypeError(f"{OP}: cameras must be gsim3d.Cameras; got {type(cameras).__name__}")
+    of_cameras = {f"cameras.{name}": getattr(cameras, name) for name in ("viewmats", "Ks", "image_cloud")}
+    check_tensors(OP, **tensors, **of_cameras, **({} if cu_rows is None else {"cu_rows": cu_rows}))
+    check_floating(OP, means=tensors["means"])
+    check_whole(OP, **{f"cameras.{name}": getattr(cameras, name) for name in ("width", "height")})
+    if ("covars" in tensors) == ("quats" in tensors or "scales" in tensors):
+        raise ValueError(f"{OP}: give quats and scales, or covars")
+    for name, value, known in (("lens", lens, tuple(LENSES)), ("jacobian", jacobian, JACOBIANS)):
+        if value not in known:
+            raise ValueError(f"{OP}: {name} must be one of {', '.join(known)}; got {value!r}")
+    shapes = {"means": "[N, 3]", "cameras.viewmats": "[I, 4, 4]", "cameras.Ks": "[I, 3, 3]"}
+    for name, shape in shapes.items():
+        value = tensors.get(name, of_cameras.get(name))
+        if value.dim() != shape.count(",") + 1:
+            raise ValueError(f"{OP}: {name} must be {shape}; got {list(value.shape)}")
+    distortion, n_images = tensors.get("distortion"), len(cameras)
+    if distortion is not None:
+        sizes = N_DISTORTION.get(lens, ())
+        if not sizes:
+            raise ValueError(f"{OP}: distortion is of the lenses opencv and fisheye; got it with {lens}")
+        if distortion.dim() != 2 or distortion.shape[0] != n_images or distortion.shape[1] not in sizes:
+            wanted = " or ".join(str(size) for size in sizes)
+            raise ValueError(f"{OP}: distortion must be [I={n_images}, {wanted}]; got {list(distortion.shape)}")
+    check_numbers(OP, largest_of=LARGEST, **tensors)
+
+
+@fake("project_gaussians")
+def _(means, quats, scales, covars, opacities, viewmats, Ks, distortion, limits, *rest):
+    n_pairs = rest[3]
+    radii = means.new_empty(n_pairs, 2, dtype=torch.int32)
+    return means.new_empty(n_pairs, 2), means.new_empty(n_pairs, 3), means.new_empty(n_pairs), radii, means.new_empty(
+        n_pairs
+    )
+
+
+@fake("project_gaussians_backward")
+def _(grad_means2d, grad_conics, grad_depths, grad_compensations, radii, means, quats, scales, covars, viewmats, *rest):
+    _, distortion, *_, viewmats_grad, lens_grad = rest
+    n, n_images = means.shape[0], viewmats.shape[0]
+    n_axes, n_lens = (0 if quats is None else n), (n_images if lens_grad else 0)
+    shapes = [(n, 3), (n_axes, 4), (n_axes, 3), (0 if covars is None else n, 3, 3)]
+    shapes += [(n_images if viewmats_grad else 0, 4, 4), (n_lens, 3, 3), (0 if distortion is None else n_lens, 8)]
+    return tuple(means.new_empty(shape) for shape in shapes)
+
+
+def _setup(ctx, inputs, output):
+    ctx.set_materialize_grads(False)
+    ctx.mark_non_differentiable(output[3])
+    means, quats, scales, covars, _, viewmats, Ks, distortion, _, image_cloud, cu_rows, cu_pairs = inputs[:12]
+    ctx.save_for_backward(
+        output[3], means, quats, scales, covars, viewmats, Ks, distortion, image_cloud, cu_rows, cu_pairs
+    )
+    n_pairs, width, height, _, _, _, dilation, lens, clamped, _ = inputs[12:]
+    ctx.options = (n_pairs, width, height, dilation, lens, clamped)
+
+
+def _backward(ctx, means2d, conics, depths, _, compensations):
+    saved = ctx.saved_tensors
+    means, n_pairs = saved[1], ctx.options[0]
+    sizes = ((2,), (3,), (), ())
+    pairs = [
+        means.new_zeros(n_pairs, *size) if grad is None else grad
+        for grad, size in zip((means2d, conics, depths, compensations), sizes)
+    ]
+    of_viewmats, of_Ks, of_distortion = ctx.needs_input_grad[5:8]
+    grads = torch.ops.gsim3d.project_gaussians_backward(
+        *pairs, *saved, *ctx.options, of_viewmats, of_Ks or of_distortion
+    )
+    wanted = (True, saved[2] is not None, saved[3] is not None, saved[4] is not None, of_viewmats, of_Ks, of_distortion)
+    means, quats, scales, covars, viewmats, Ks, distortion = (
+        grad if want else None for grad, want in zip(grads, wanted, strict=True)
+    )
+    return means, quats, scales, covars, None, viewmats, Ks, distortion, *[None] * 14
+
+
+register_gradients(
+    "project_gaussians",
+    _backward,
+    _setup,
+    gradient_ops=["project_gaussians_backward"],
+    without=["opacities", "limits"],
+)
+register_autocast("project_gaussians", "float32")
+
+
+@fake("sh_to_color")
+def _(directions, sh):
+    return directions.new_empty(*directions.shape[:3], sh.shape[3])
+
+
+@fake("sh_to_color_backward")
+def _(grad, directions, sh):
+    return directions.new_empty(directions.shape), sh.new_empty(sh.shape)
+
+
+def _sh_setup(ctx, inputs, output):
+    ctx.save_for_backward(*inputs)
+
+
+def _sh_backward(ctx, grad):
+    return torch.ops.gsim3d.sh_to_color_backward(grad, *ctx.saved_tensors)
+
+
+register_gradients("sh_to_color", _sh_backward, _sh_setup, gradient_ops=["sh_to_color_backward"])
+register_autocast("sh_to_color", "float32")

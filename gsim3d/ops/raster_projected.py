@@ -1,0 +1,163 @@
+"""Blending of Gaussians that are projected already: the second half of the rasterizer, with any channels."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from gsim3d.ops._arguments import check_floating, check_numbers, check_tensors, check_whole, within_memory
+from gsim3d.ops._register import fake, register_autocast, register_gradients
+from gsim3d.ops.raster import CUTOFFS, LARGEST, Rendering, sizes_of_state, state_bytes
+
+OP = "rasterize_projected"
+
+
+def rasterize_projected(
+    means2d: Tensor,
+    conics: Tensor,
+    depths: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    *,
+    width: int,
+    height: int,
+    cu_pairs: Tensor | None = None,
+    background: Tensor | None = None,
+    absolute: Tensor | None = None,
+    cutoff: str = "exact",
+) -> Rendering:
+    """Renders what :func:`project_gaussians` returns, as :func:`rasterize_gaussians` does in one call.
+
+    A row whose conic is not positive definite, or whose depth is not positive, is left out.
+
+    Args:
+        means2d: [P, 2] pixels; float32 or float64.
+        conics: [P, 3] px^-2, entries (xx, xy, yy) of the inverse covariance.
+        depths: [P] metres.
+        opacities: [P] in [0, 1].
+        colors: [P, D], any D; float16 and bfloat16 are blended in the dtype of ``means2d``.
+        width, height: pixels.
+        cu_pairs: int64 [I + 1], rows of image i are cu_pairs[i] .. cu_pairs[i + 1]; default one image.
+        background: [D] or [I, D]; default black.
+        absolute: [P, 2], zeros that ask for a gradient; theirs is the sum over pixels of what each adds to
+            |gradient| of ``means2d`` (AbsGS).
+        cutoff: "exact" or "smooth", as of :func:`rasterize_gaussians`.
+    Returns:
+        Rendering with ``color`` [I, H, W, D] and without features, dtype of ``means2d``.
+    Gradients:
+        means2d, conics, depths (of ``depth``), opacities, colors and background, once.
+    Determinism:
+        equal bits for any number of threads; on a GPU from run to run, and nothing waits for the device.
+    Raises:
+        NumericalError: a number is not finite or beyond 1e15; CPU only. On a GPU such a row is left out.
+        ValueError, TypeError: an argument is malformed; the message names it.
+    Source:
+        Kerbl et al. 2023 (3D Gaussian splatting), Ye et al. 2024 (AbsGS).
+
+    Example:
+        >>> mean, conic, one = torch.tensor([[4.0, 4.0]]), torch.tensor([[0.5, 0.0, 0.5]]), torch.ones(1)
+        >>> image = rasterize_projected(mean, conic, one, 0.5 * one, torch.ones(1, 5), width=8, height=8)
+        >>> image.color.shape, round(float(image.alpha[0, 4, 4]), 3)
+        (torch.Size([1, 8, 8, 5]), 0.441)
+    """
+    rows = {"means2d": means2d, "conics": conics, "depths": depths, "opacities": opacities, "colors": colors}
+    optional = {"cu_pairs": cu_pairs, "background": background, "absolute": absolute}
+    _check(rows, {name: value for name, value in optional.items() if value is not None}, width, height, cutoff)
+    if cu_pairs is None:
+        cu_pairs = torch.tensor([0, means2d.shape[0]], device=means2d.device)
+    n_images, n_channels = cu_pairs.shape[0] - 1, colors.shape[1]
+    if background is None:
+        background = means2d.new_zeros(n_images, n_channels)
+    background = background.expand(n_images, n_channels).to(means2d.dtype)
+    colors = colors.to(means2d.dtype)
+    missing = max(0, 3 - n_channels)
+    args = (
+        *(means2d, conics, depths, opacities, F.pad(colors[:, :3], (0, missing)), colors[:, 3:]),
+        *(F.pad(background[:, :3], (0, missing)), absolute, torch.arange(n_images, device=means2d.device), cu_pairs),
+        *(width, height, CUTOFFS[cutoff], *sizes_of_state(means2d, n_images, n_images, width, height)),
+    )
+    out = within_memory(OP, f"width={width}, height={height}", torch.ops.gsim3d.rasterize_projected, *args)
+    color, alpha, depth, features = out[:4]
+    if n_channels > 3:
+        behind = (1 - alpha)[..., None] * background[:, None, None, 3:]
+        color = torch.cat([color, features + behind], -1)
+    return Rendering(color[..., :n_channels], alpha, depth, None)
+
+
+def _check(rows: dict[str, Tensor], optional: dict[str, Tensor], width: int, height: int, cutoff: str) -> None:
+    check_tensors(OP, **rows, **optional)
+    check_floating(OP, means2d=rows["means2d"])
+    check_whole(OP, width=width, height=height)
+    if cutoff not in ("exact", "smooth"):
+        raise ValueError(f"{OP}: cutoff must be one of exact, smooth; got {cutoff!r}")
+    n = rows["means2d"].shape[0] if rows["means2d"].dim() else 0
+    shapes = {"means2d": (n, 2), "conics": (n, 3), "depths": (n,), "opacities": (n,), "absolute": (n, 2)}
+    for name, value in (rows | optional).items():
+        if name in shapes and value.shape != shapes[name]:
+            raise ValueError(f"{OP}: {name} must be {['P', *shapes[name][1:]]} with P={n}; got {list(value.shape)}")
+    colors, cu_pairs, background = rows["colors"], optional.get("cu_pairs"), optional.get("background")
+    if colors.dim() != 2 or colors.shape[0] != n or not colors.is_floating_point():
+        raise ValueError(f"{OP}: colors must be [P={n}, D] of floats; got {colors.dtype} {list(colors.shape)}")
+    if cu_pairs is not None and (cu_pairs.dim() != 1 or cu_pairs.shape[0] < 1):
+        raise ValueError(f"{OP}: cu_pairs must be [I + 1]; got {list(cu_pairs.shape)}")
+    n_images = 1 if cu_pairs is None else cu_pairs.shape[0] - 1
+    if background is not None and background.shape not in ((colors.shape[1],), (n_images, colors.shape[1])):
+        raise ValueError(
+            f"{OP}: background must be [D={colors.shape[1]}] or [I={n_images}, D]; got {list(background.shape)}"
+        )
+    check_numbers(OP, largest_of=LARGEST, **rows)
+
+
+@fake("rasterize_projected")
+def _(means2d, conics, depths, opacities, color, features, background, absolute, image_cloud, cu_rows, *rest):
+    width, height, _, *sizes = rest
+    n_images = background.shape[0]
+    shape = (n_images, height, width)
+    state = state_bytes(means2d, n_images, n_images, width, height, sizes[0], sizes[2])
+    return (
+        means2d.new_empty(*shape, 3),
+        means2d.new_empty(shape),
+        means2d.new_empty(shape),
+        means2d.new_empty(*shape, features.shape[1]),
+        means2d.new_empty(shape),
+        means2d.new_empty(shape, dtype=torch.int32),
+        means2d.new_empty(state, dtype=torch.uint8),
+    )
+
+
+@fake("rasterize_projected_backward")
+def _(grad_color, grad_alpha, grad_depth, grad_features, transmittance, last, state, *inputs):
+    *inputs, absolute = inputs
+    shapes = [x.shape for x in inputs[:7]]
+    shapes[5] = (shapes[5][0], shapes[5][1] + (2 if absolute else 0))
+    return tuple(inputs[0].new_empty(shape) for shape in shapes)
+
+
+def _setup(ctx, inputs, output):
+    ctx.set_materialize_grads(False)
+    ctx.mark_non_differentiable(*output[4:])
+    ctx.save_for_backward(*output[4:], *inputs[:7], *inputs[8:10])
+    ctx.options = inputs[10:]
+
+
+def _backward(ctx, *grads):
+    saved = ctx.saved_tensors
+    transmittance, n_features = saved[0], saved[8].shape[1]
+    sizes = ((3,), (), (), (n_features,))
+    images = [
+        transmittance.new_zeros(*transmittance.shape, *size) if grad is None else grad
+        for grad, size in zip(grads, sizes, strict=False)
+    ]
+    with_absolute = ctx.needs_input_grad[7]
+    *rows, features, background = torch.ops.gsim3d.rasterize_projected_backward(
+        *images, *saved, *ctx.options, with_absolute
+    )
+    absolute = features[:, n_features:] if with_absolute else None
+    return (*rows, features[:, :n_features], background, absolute, *[None] * 8)
+
+
+register_gradients(
+    "rasterize_projected", _backward, _setup, gradient_ops=["rasterize_projected_backward"]
+)
+register_autocast("rasterize_projected", "float32")
