@@ -55,6 +55,10 @@ TOLERANCES = {
     "pool_float64": Tolerance(1e-14, 4e-16, EPYC, "float64 sums of up to 20 rows, another order of additions"),
     "row_norm_float32": Tolerance(3e-6, 1e-6, EPYC, "float32 means of up to 1,000 channels against float64"),
     "row_norm_float64": Tolerance(1e-14, 2e-15, EPYC, "as row_norm_float32, in float64"),
+    "projection_float32": Tolerance(2e-5, 1e-6, EPYC, "float32 Jacobians and determinants against float64"),
+    "projection_float64": Tolerance(1e-12, 1e-14, EPYC, "as projection_float32, in float64"),
+    "projection_grad_float32": Tolerance(1e-4, 1e-5, EPYC, "as projection_float32"),
+    "projection_grad_float64": Tolerance(1e-11, 1e-13, EPYC, "as projection_float32, in float64"),
     "raster_float32": Tolerance(
         1e-5, 2.2e-6, EPYC, "float32 exponents and products of up to 60 layers against float64"
     ),

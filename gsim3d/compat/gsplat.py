@@ -92,8 +92,8 @@ def rasterization(
         quats: [..., N, 4] (w, x, y, z), of any length.
         scales: [..., N, 3] metres, standard deviations.
         opacities: [..., N] in [0, 1].
-        colors: [..., N, D] or [..., C, N, D]; with ``sh_degree`` [N, K, D] or [..., N, K, D] coefficients; also float16.
-            None where ``render_mode`` has no colour.
+        colors: [..., N, D] or [..., C, N, D]; with ``sh_degree`` [N, K, D] or [..., N, K, D] coefficients; also
+            float16. None where ``render_mode`` has no colour.
         viewmats: [..., C, 4, 4] world to camera.
         Ks: [..., C, 3, 3] pixels.
         width, height: pixels.
@@ -104,16 +104,16 @@ def rasterization(
         packed: ``meta`` has a row for each Gaussian that is seen; on a GPU counting them waits for it.
         backgrounds: [..., C, D]; black where there are none.
         render_mode: "RGB", "D", "ED", "RGB+D" or "RGB+ED".
-        absgrad: after the backward pass ``meta["means2d"].absgrad`` holds the sum over pixels of the absolute gradients.
+        absgrad: after the backward pass ``meta["means2d"].absgrad`` is the sum over pixels of absolute gradients.
         rasterize_mode: "classic", or "antialiased": opacities are multiplied by Mip-Splatting's compensation.
         camera_model: "pinhole", "ortho" or "fisheye".
         covars: [..., N, 3, 3] m^2, in place of ``quats`` and ``scales``.
         radial_coeffs: [..., C, 6] k1 to k6 of OpenCV's pinhole, or [..., C, 4] k1 to k4 of its fisheye.
         tangential_coeffs: [..., C, 2] p1, p2 of OpenCV's pinhole.
         tile_size, channel_chunk, segmented: of gsplat's kernels; they change no result here.
-        sparse_grad, distributed, with_ut, with_eval3d, return_normals, global_z_order, rays, thin_prism_coeffs,
-            ftheta_coeffs, lidar_coeffs, external_distortion_coeffs, rolling_shutter, viewmats_rs, ut_params,
-            extra_signals, extra_signals_sh_degree, renderer_config: not offered; any but the default raises.
+        sparse_grad: not offered, like distributed, with_ut, with_eval3d, return_normals, global_z_order, rays,
+            thin_prism_coeffs, ftheta_coeffs, lidar_coeffs, external_distortion_coeffs, rolling_shutter, viewmats_rs,
+            ut_params, extra_signals, extra_signals_sh_degree and renderer_config; any but the default raises.
     Returns:
         Images [..., C, height, width, D (+ 1)], depth last; alpha [..., C, height, width, 1]; ``meta`` with "means2d"
         [..., C, N, 2], "radii" int32 [..., C, N, 2], "depths" and "opacities" [..., C, N], "conics" [..., C, N, 3], and
@@ -147,9 +147,7 @@ def rasterization(
     lens, distortion = _lens(LENSES[camera_model], radial_coeffs, tangential_coeffs, n_images)
     image_cloud = torch.arange(n_batches, device=means.device).repeat_interleave(n_cameras, output_size=n_images)
     no_plane = means.new_zeros(n_images)
-    cameras = Cameras(
-        viewmats.reshape(-1, 4, 4), Ks.reshape(-1, 3, 3), no_plane, no_plane, image_cloud, width, height
-    )
+    cameras = Cameras(viewmats.reshape(-1, 4, 4), Ks.reshape(-1, 3, 3), no_plane, no_plane, image_cloud, width, height)
     shapes = (None, None) if covars is not None else (quats.reshape(-1, 4), scales.reshape(-1, 3))
     projection = project_gaussians(
         means.reshape(-1, 3),
@@ -170,7 +168,7 @@ def rasterization(
     )
     values = means.new_zeros(n_images * n, 0)
     if with_color:
-        values = _colors(colors, sh_degree, means, viewmats).reshape(n_images * n, -1)
+        values = _colors(colors, sh_degree, means, viewmats).flatten(0, -2)
     of_images = opacities[..., None, :].expand(*batch, n_cameras, n).reshape(-1)
     alphas = of_images * projection.compensations if antialiased else of_images
     rows = (*projection[:4], alphas, values)
@@ -186,7 +184,7 @@ def rasterization(
     meta |= {"radii": radii, "means2d": means2d, "depths": depths, "conics": conics, "opacities": alphas}
     meta |= {"width": width, "height": height, "tile_size": 16 if tile_size is None else tile_size}
     meta |= {"n_batches": n_batches, "n_cameras": n_cameras}
-    flat = [row.reshape(-1, *row.shape[len(sizes) :]) for row in (means2d, conics, depths, alphas, values)]
+    flat = [row.flatten(0, len(sizes) - 1) for row in (means2d, conics, depths, alphas, values)]
     if backgrounds is not None:
         backgrounds = backgrounds.reshape(n_images, -1) if with_color else None
     absolute = _absolute(means2d) if absgrad and means2d.requires_grad else None
@@ -255,13 +253,13 @@ def _colors(colors: Tensor | None, sh_degree: int | None, means: Tensor, viewmat
                 f"{list(colors.shape)}"
             )
         return colors
-    shared = colors.dim() == 3
-    if colors.shape[:-2] not in ((n,), (*batch, n)) or not 0 <= sh_degree <= 4 or colors.shape[-2] < (sh_degree + 1) ** 2:
+    shared, n_terms = colors.dim() == 3, (sh_degree + 1) ** 2
+    if colors.shape[:-2] not in ((n,), (*batch, n)) or not 0 <= sh_degree <= 4 or colors.shape[-2] < n_terms:
         raise ValueError(
-            f"rasterization: with sh_degree={sh_degree} (0 to 4) colors must be [N={n}, K >= (sh_degree + 1)^2, D]; got "
+            f"rasterization: with sh_degree={sh_degree} (0 to 4) colors must be [N={n}, K >= {n_terms}, D]; got "
             f"{list(colors.shape)}"
         )
-    sh = colors[..., : (sh_degree + 1) ** 2, :]
+    sh = colors[..., :n_terms, :]
     turned, moved = viewmats[..., :3, :3], viewmats[..., :3, 3]
     centre = -(turned.mT @ moved[..., None])[..., 0]
     directions = means[..., None, :, :] - centre[..., None, :]

@@ -117,8 +117,8 @@ def project_gaussians(
     if cu_rows is None:
         cu_rows = torch.tensor([0, n], device=means.device)
         n_pairs = n * n_images
-    counts = (cu_rows[1:] - cu_rows[:-1])[cameras.image_cloud]
-    cu_pairs = F.pad(counts.cumsum(0), (1, 0))
+    counts = F.pad(cu_rows[1:] - cu_rows[:-1], (0, 1))  # a cloud that is none has no rows
+    cu_pairs = F.pad(counts[cameras.image_cloud.clamp(0, len(counts) - 1)].cumsum(0), (1, 0))
     if n_pairs is None:
         if means.device.type != "cpu":
             raise ValueError(f"{OP}: n_pairs is needed beside cu_rows on a GPU, where counting would wait for it")
@@ -134,7 +134,10 @@ def project_gaussians(
         *(cameras.image_cloud, cu_rows, cu_pairs, n_pairs, cameras.width, cameras.height),
         *(near_plane, far_plane, radius_clip, dilation, LENSES[lens], jacobian == "clamped", antialiased),
     )
-    return Projection(*within_memory(OP, f"n_pairs={n_pairs}", torch.ops.gsim3d.project_gaussians, *args), cu_pairs)
+    means2d, conics, depths, radii, compensations = within_memory(
+        OP, f"n_pairs={n_pairs}", torch.ops.gsim3d.project_gaussians, *args
+    )
+    return Projection(means2d, conics, depths, radii, compensations, cu_pairs)
 
 
 def lens_limits(lens: str, distortion: Tensor) -> Tensor:
@@ -154,12 +157,13 @@ def lens_limits(lens: str, distortion: Tensor) -> Tensor:
         """bool [I, S] at radii [I, S]."""
         r2 = r * r
         if lens == "fisheye":
-            return 1 + sum((2 * n + 3) * k[n][:, None] * r2 ** (n + 1) for n in range(4)) <= 0
+            rise = 1 + sum((2 * n + 3) * k[n][:, None] * r2 ** (n + 1) for n in range(4))
+            return torch.le(rise, 0)
         up, down = ((k[0], k[1], k[4]), (k[5], k[6], k[7]))
-        value, slope = (1 + sum(f(n) * up[n][:, None] * r2 ** (n + 1) for n in range(3)) for f in (_one, _odd))
-        below = 1 + sum(down[n][:, None] * r2 ** (n + 1) for n in range(3))
-        descent = sum((2 * n + 2) * down[n][:, None] * r2 ** (n + 1) for n in range(3))
-        return (below <= 0) | (slope * below - value * descent <= 0)
+        above, below = (1 + sum(c[n][:, None] * r2 ** (n + 1) for n in range(3)) for c in (up, down))
+        slope = 1 + sum((2 * n + 3) * up[n][:, None] * r2 ** (n + 1) for n in range(3))  # of r * above
+        descent = sum((2 * n + 2) * down[n][:, None] * r2 ** (n + 1) for n in range(3))  # r times that of below
+        return torch.le(below, 0) | torch.le(slope * below - above * descent, 0)
 
     bad = folds(grid.expand(len(distortion), -1))
     first = bad.int().argmax(1)
@@ -169,14 +173,6 @@ def lens_limits(lens: str, distortion: Tensor) -> Tensor:
         at = folds(middle[:, None])[:, 0]
         low, high = torch.where(at, low, middle), torch.where(at, middle, high)
     return torch.where(bad.any(1), low, math.inf)
-
-
-def _one(n: int) -> int:
-    return 1
-
-
-def _odd(n: int) -> int:
-    return 2 * n + 3
 
 
 def sh_to_color(directions: Tensor, sh: Tensor) -> Tensor:
@@ -231,9 +227,12 @@ def _check(tensors: dict, cameras: Cameras, cu_rows: Tensor | None, lens: str, j
             raise ValueError(f"{OP}: {name} must be one of {', '.join(known)}; got {value!r}")
     shapes = {"means": "[N, 3]", "cameras.viewmats": "[I, 4, 4]", "cameras.Ks": "[I, 3, 3]"}
     for name, shape in shapes.items():
-        value = tensors.get(name, of_cameras.get(name))
-        if value.dim() != shape.count(",") + 1:
-            raise ValueError(f"{OP}: {name} must be {shape}; got {list(value.shape)}")
+        tensor = (tensors | of_cameras)[name]
+        if tensor.dim() != shape.count(",") + 1:
+            raise ValueError(f"{OP}: {name} must be {shape}; got {list(tensor.shape)}")
+    for name, indices in (("cameras.image_cloud", cameras.image_cloud), ("cu_rows", cu_rows)):
+        if indices is not None and (indices.dtype != torch.int64 or indices.dim() != 1):
+            raise ValueError(f"{OP}: {name} must be int64 and a list; got {indices.dtype} {list(indices.shape)}")
     distortion, n_images = tensors.get("distortion"), len(cameras)
     if distortion is not None:
         sizes = N_DISTORTION.get(lens, ())
@@ -249,8 +248,12 @@ def _check(tensors: dict, cameras: Cameras, cu_rows: Tensor | None, lens: str, j
 def _(means, quats, scales, covars, opacities, viewmats, Ks, distortion, limits, *rest):
     n_pairs = rest[3]
     radii = means.new_empty(n_pairs, 2, dtype=torch.int32)
-    return means.new_empty(n_pairs, 2), means.new_empty(n_pairs, 3), means.new_empty(n_pairs), radii, means.new_empty(
-        n_pairs
+    return (
+        means.new_empty(n_pairs, 2),
+        means.new_empty(n_pairs, 3),
+        means.new_empty(n_pairs),
+        radii,
+        means.new_empty(n_pairs),
     )
 
 

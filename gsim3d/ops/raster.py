@@ -249,7 +249,7 @@ def _tiles(n_images, width, height):
     return n_images * ((width + 15) // 16) * ((height + 15) // 16)
 
 
-def sizes_of_state(means, n_images, n_clouds, width, height):
+def sizes_of_state(means: Tensor, n_images: int, n_clouds: int, width: int, height: int) -> tuple[int, int, int]:
     """(max_pairs, max_entries, max_slots): RasterLimits of csrc/gsim3d/raster/raster.h. Exact for clouds shown by
     equally many images; about twice what Gaussians of a few pixels need."""
     if means.device.type != "cuda":
@@ -262,7 +262,9 @@ def sizes_of_state(means, n_images, n_clouds, width, height):
     return pairs, max(n, entries), max(4 * n, slots)
 
 
-def state_bytes(means, n_images, n_clouds, width, height, max_pairs, max_slots):
+def state_bytes(
+    means: Tensor, n_images: int, n_clouds: int, width: int, height: int, max_pairs: int, max_slots: int
+) -> int:
     """raster_state_bytes of csrc/gsim3d/raster/raster.h."""
     if means.device.type != "cuda":
         return 0

@@ -40,8 +40,8 @@ def rasterize_projected(
         width, height: pixels.
         cu_pairs: int64 [I + 1], rows of image i are cu_pairs[i] .. cu_pairs[i + 1]; default one image.
         background: [D] or [I, D]; default black.
-        absolute: [P, 2], zeros that ask for a gradient; theirs is the sum over pixels of what each adds to
-            |gradient| of ``means2d`` (AbsGS).
+        absolute: [P, 2], zeros that ask for a gradient; theirs is the sum over pixels of the absolute values of what
+            each adds to the gradient of ``means2d`` (AbsGS).
         cutoff: "exact" or "smooth", as of :func:`rasterize_gaussians`.
     Returns:
         Rendering with ``color`` [I, H, W, D] and without features, dtype of ``means2d``.
@@ -157,7 +157,5 @@ def _backward(ctx, *grads):
     return (*rows, features[:, :n_features], background, absolute, *[None] * 8)
 
 
-register_gradients(
-    "rasterize_projected", _backward, _setup, gradient_ops=["rasterize_projected_backward"]
-)
+register_gradients("rasterize_projected", _backward, _setup, gradient_ops=["rasterize_projected_backward"])
 register_autocast("rasterize_projected", "float32")

@@ -1,0 +1,330 @@
+"""gsplat's call: against plain torch, against what gsplat 1.5.3 computes in torch, and with its strategy."""
+
+import importlib.util
+
+import pytest
+import torch
+
+from gsim3d.compat.gsplat import rasterization
+from gsim3d.errors import InputError
+from gsim3d.ops import rasterize_gaussians
+from tests.asserts import assert_close_relative_to_max, assert_same_bits
+from tests.ops.raster_scene import random_scene
+from tests.oracle import projection as projection_oracle, raster as raster_oracle
+
+SIZE = {"width": 45, "height": 37}
+with_gsplat = pytest.mark.skipif(
+    importlib.util.find_spec("gsplat") is None, reason="pip install --no-deps gsplat==1.5.3 rich jaxtyping"
+)
+
+
+def scene_of(batch=(), cameras=2, n=40, channels=3, seed=0, dtype=torch.float64):
+    """Arguments of one call, opacities below 0.98."""
+    g = torch.Generator().manual_seed(seed)
+    scene = random_scene(n=n, clouds=1, images=cameras, seed=seed)
+    Ks = scene.Ks.clone()
+    Ks[:, 0, 1] = 0  # gsplat has no skew
+    colors = torch.rand(*batch, n, channels, generator=g, dtype=torch.float64)
+    parts = {
+        "means": scene.means + 0.1 * torch.randn(*batch, n, 3, generator=g, dtype=torch.float64),
+        "quats": scene.quats.expand(*batch, n, 4),
+        "scales": scene.scales.expand(*batch, n, 3),
+        "opacities": scene.opacities.expand(*batch, n),
+        "colors": colors,
+        "viewmats": scene.viewmats.expand(*batch, cameras, 4, 4),
+        "Ks": Ks.expand(*batch, cameras, 3, 3),
+    }
+    return {name: x.to(dtype).contiguous() for name, x in parts.items()}
+
+
+def expected_images(arguments, *, backgrounds=None, render_mode="RGB", eps2d=0.3, antialiased=False, lens="pinhole"):
+    """[C, H, W, X] and alpha [C, H, W, 1] of one batch by the oracles; colours [N, D] or [C, N, D]."""
+    means, opacities, colors = (arguments[name] for name in ("means", "opacities", "colors"))
+    shapes = arguments.get("covars")
+    if shapes is None:
+        shapes = projection_oracle.covariances(arguments["quats"], arguments["scales"])
+    images, alphas = [], []
+    for i, (viewmat, K) in enumerate(zip(arguments["viewmats"], arguments["Ks"])):
+        means2d, conics, depths, compensations, _ = projection_oracle.project(
+            means, shapes, viewmat, K, 45, 37, lens=lens, distortion=torch.zeros(8), dilation=eps2d, clamped=True
+        )
+        opacity = opacities * compensations if antialiased else opacities
+        of_view = colors[i] if colors.dim() == 3 else colors
+        seen = depths > 0.01
+        rows = [x[seen] for x in (means2d, conics, depths, opacity, of_view)]
+        background = torch.zeros(1, of_view.shape[1]).double() if backgrounds is None else backgrounds[i : i + 1]
+        color, alpha, depth = blend(*rows, background)
+        alpha, depth = alpha[..., None], depth[..., None]
+        depth = depth / alpha.clamp_min(1e-10) if render_mode.endswith("ED") else depth
+        parts = [color] * ("RGB" in render_mode) + [depth] * ("D" in render_mode.removeprefix("RGB"))
+        images.append(torch.cat(parts, -1)), alphas.append(alpha)
+    return torch.stack(images), torch.stack(alphas)
+
+
+def blend(means2d, conics, depths, opacities, colors, background):
+    y, x = torch.meshgrid(torch.arange(37).double(), torch.arange(45).double(), indexing="ij")
+    light, going = torch.ones(37, 45).double(), torch.ones(37, 45, dtype=torch.bool)
+    color, depth = torch.zeros(37, 45, colors.shape[1]).double(), torch.zeros(37, 45).double()
+    for n in torch.argsort(depths.detach(), stable=True):
+        dx, dy = x + 0.5 - means2d[n, 0], y + 0.5 - means2d[n, 1]
+        a, b, c = conics[n]
+        alpha = (opacities[n] * torch.exp(-(a * dx * dx + 2 * b * dx * dy + c * dy * dy) / 2)).clamp_max(0.99)
+        alpha = torch.where(alpha >= 1 / 255, alpha, 0)
+        rest = light * (1 - alpha)
+        going = going & (rest >= 1e-4)
+        weight = torch.where(going, light * alpha, 0)
+        color, depth = color + weight[..., None] * colors[n], depth + weight * depths[n]
+        light = torch.where(going, rest, light)
+    return color + light[..., None] * background, 1 - light, depth
+
+
+# ---- images and gradients against plain torch -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("render_mode", ["RGB", "D", "ED", "RGB+D", "RGB+ED"])
+@pytest.mark.parametrize("per_view", [False, True])
+@pytest.mark.parametrize("packed", [False, True])
+def test_render_modes(device, render_mode, per_view, packed):
+    arguments = scene_of()
+    if per_view:
+        arguments["colors"] = torch.rand(2, 40, 3, dtype=torch.float64)
+    leaves = {name: x.clone().requires_grad_() for name, x in arguments.items()}
+    backgrounds = torch.rand(2, 3, dtype=torch.float64)
+    expected = expected_images(leaves, render_mode=render_mode, backgrounds=backgrounds)
+    moved = {name: x.detach().to(device).requires_grad_() for name, x in arguments.items()}
+    *actual, _ = rasterization(
+        **moved, **SIZE, render_mode=render_mode, backgrounds=backgrounds.to(device), packed=packed
+    )
+    for a, e in zip(actual, expected, strict=True):
+        assert_close_relative_to_max(a, e, "raster_float64")
+    mixes = [torch.randn_like(e) for e in expected]
+    names = [name for name in leaves if name != "Ks" and (name != "colors" or "RGB" in render_mode)]
+    both = []
+    for images, inputs in ((actual, moved), (expected, leaves)):
+        loss = sum((m.to(x) * x).sum() for m, x in zip(mixes, images, strict=True))
+        both.append(torch.autograd.grad(loss, [inputs[name] for name in names]))
+    for name, a, e in zip(names, *both, strict=True):
+        assert_close_relative_to_max(a, e, "projection_grad_float64", name)
+
+
+@pytest.mark.parametrize("channels", [1, 3, 32, 128])
+@pytest.mark.parametrize("batch", [(), (2,), (1, 2)])
+def test_channels_and_batches(device, batch, channels):
+    arguments = {name: x.to(device) for name, x in scene_of(batch, channels=channels, n=20).items()}
+    color, alpha, meta = rasterization(**arguments, **SIZE, packed=False)
+    assert color.shape == (*batch, 2, 37, 45, channels) and alpha.shape == (*batch, 2, 37, 45, 1)
+    assert meta["means2d"].shape == (*batch, 2, 20, 2) and meta["radii"].dtype == torch.int32
+    assert meta["n_batches"] == max(1, len(batch) and 2) and meta["n_cameras"] == 2
+    flat = {name: x.reshape(-1, *x.shape[len(batch) :]).cpu() for name, x in arguments.items()}
+    for i, image in enumerate(color.reshape(-1, *color.shape[len(batch) :])):
+        expected = expected_images({name: x[i] for name, x in flat.items()})[0]
+        assert_close_relative_to_max(image, expected, "raster_float64")
+
+
+@pytest.mark.parametrize("eps2d", [0.3, 0.0, 1.0])
+@pytest.mark.parametrize("with_covars", [False, True])
+@pytest.mark.parametrize("camera_model", ["pinhole", "ortho", "fisheye"])
+def test_antialiased_covars_and_cameras(device, camera_model, with_covars, eps2d):
+    arguments, lens = scene_of(), {"ortho": "orthographic"}.get(camera_model, camera_model)
+    if with_covars:
+        arguments["covars"] = projection_oracle.covariances(arguments["quats"], arguments["scales"])
+    expected = expected_images(arguments, antialiased=True, eps2d=eps2d, lens=lens)
+    options = {"rasterize_mode": "antialiased", "camera_model": camera_model, "eps2d": eps2d}
+    moved = {name: x.to(device) for name, x in arguments.items()}
+    if with_covars:
+        moved |= {"quats": None, "scales": None}
+    *actual, meta = rasterization(**moved, **SIZE, **options, packed=False)
+    for a, e in zip(actual, expected, strict=True):
+        assert_close_relative_to_max(a, e, "raster_float64")
+    assert (meta["opacities"].cpu() <= arguments["opacities"] + 1e-12).all()
+
+
+@pytest.mark.parametrize("sh_degree", range(5))
+@pytest.mark.parametrize("batch", [(), (2,)])
+def test_harmonics(device, batch, sh_degree):
+    arguments = {name: x.to(device) for name, x in scene_of(batch, n=20).items()}
+    shared = 0.3 * torch.randn(20, 25, 3, dtype=torch.float64, device=device)
+    arguments["colors"] = shared
+    color, *_ = rasterization(**arguments, **SIZE, sh_degree=sh_degree)
+    again, *_ = rasterization(**arguments | {"colors": shared.expand(*batch, 20, 25, 3)}, **SIZE, sh_degree=sh_degree)
+    assert_close_relative_to_max(again, color, 1e-14)
+    viewmats = arguments["viewmats"]
+    centre = torch.linalg.inv(viewmats)[..., :3, 3]
+    direction = torch.nn.functional.normalize(arguments["means"][..., None, :, :] - centre[..., None, :], dim=-1)
+    basis = raster_oracle.legendre_basis(direction.cpu(), sh_degree)
+    used = shared.cpu()[:, : basis.shape[-1]]
+    of_views = (torch.einsum("...nk,nkd->...nd", basis, used) + 0.5).clamp_min(0)
+    expected, *_ = rasterization(**arguments | {"colors": of_views.to(device)}, **SIZE)
+    assert_close_relative_to_max(color, expected, 1e-12)
+
+
+def test_distorted_cameras(device):
+    arguments = {name: x.to(device) for name, x in scene_of(cameras=1).items()}
+    radial = torch.tensor([[0.1, 0.02, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64, device=device).requires_grad_()
+    tangential = torch.tensor([[0.01, -0.01]], dtype=torch.float64, device=device).requires_grad_()
+    color, *_ = rasterization(**arguments, **SIZE, radial_coeffs=radial, tangential_coeffs=tangential)
+    straight, *_ = rasterization(**arguments, **SIZE)
+    assert relative(color, straight) > 1e-2
+    for grad in torch.autograd.grad((color**2).sum(), (radial, tangential)):
+        assert grad.abs().max() > 0
+
+
+def relative(a, b):
+    return ((a - b).abs().max() / b.abs().max()).item()
+
+
+def test_near_far_and_radius_clip(device):
+    arguments = {name: x.to(device) for name, x in scene_of().items()}
+    _, _, meta = rasterization(**arguments, **SIZE, near_plane=2.8, far_plane=3.3, radius_clip=4.0, packed=False)
+    seen = (meta["radii"] > 0).all(-1)
+    assert 0 < seen.sum() < 40
+    assert ((meta["depths"][seen] > 2.8) & (meta["depths"][seen] < 3.3)).all() and (meta["radii"][seen] > 4).any(
+        -1
+    ).all()
+
+
+def test_fused_op_agrees(device):
+    scene = random_scene(n=60, clouds=1, images=2, sh_terms=0, dtype=torch.float32).to(device)
+    fused = rasterize_gaussians(
+        scene.means, scene.quats, scene.scales, scene.opacities, scene.cameras(),
+        colors=scene.color, background=scene.background, jacobian="clamped",
+    )  # fmt: skip
+    color, alpha, _ = rasterization(
+        scene.means, scene.quats, scene.scales, scene.opacities, scene.color, scene.viewmats, scene.Ks,
+        **SIZE, backgrounds=scene.background,
+    )  # fmt: skip
+    assert_close_relative_to_max(color, fused.color, "raster_float32")
+    assert_close_relative_to_max(alpha[..., 0], fused.alpha, "raster_float32")
+
+
+# ---- meta, gradients of the 2D means --------------------------------------------------------------------------------
+
+
+def test_packed_meta_lists_what_is_seen(device):
+    arguments = {name: x.to(device) for name, x in scene_of((2,)).items()}
+    color, _, whole = rasterization(**arguments, **SIZE, packed=False)
+    packed_color, _, packed = rasterization(**arguments, **SIZE)
+    assert_same_bits(packed_color, color)
+    assert whole["batch_ids"] is whole["camera_ids"] is whole["gaussian_ids"] is None
+    at = (packed["batch_ids"], packed["camera_ids"], packed["gaussian_ids"])
+    assert len(at[0]) == (whole["radii"] > 0).all(-1).sum() < whole["radii"][..., 0].numel()
+    for name in ("means2d", "radii", "depths", "conics", "opacities"):
+        assert_same_bits(packed[name], whole[name][at])
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_means2d_have_gradients(device, packed):
+    arguments = {name: x.to(device).requires_grad_() for name, x in scene_of().items()}
+    color, _, meta = rasterization(**arguments, **SIZE, absgrad=True, packed=packed)
+    meta["means2d"].retain_grad()
+    (color**2).sum().backward()
+    grad, absolute = meta["means2d"].grad, meta["means2d"].absgrad
+    assert grad.shape == absolute.shape == meta["means2d"].shape and grad.abs().max() > 0
+    assert (absolute >= grad.abs() - 1e-12).all() and absolute.sum() > 1.1 * grad.abs().sum()
+
+
+def test_lists_of_tiles_are_refused_by_name():
+    *_, meta = rasterization(**scene_of(), **SIZE)
+    for name in ("isect_ids", "isect_offsets", "flatten_ids", "tiles_per_gauss"):
+        with pytest.raises(InputError, match=name):
+            meta[name]
+    with pytest.raises(KeyError):
+        meta["nothing"]
+    assert meta["tile_size"] == 16 and meta["width"] == 45 and meta["height"] == 37
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("with_ut", True), ("with_eval3d", True), ("rays", torch.zeros(1)), ("ftheta_coeffs", object()),
+     ("lidar_coeffs", object()), ("rolling_shutter", object()), ("viewmats_rs", torch.zeros(1)), ("distributed", True),
+     ("sparse_grad", True), ("global_z_order", False), ("return_normals", True), ("extra_signals", torch.zeros(1)),
+     ("thin_prism_coeffs", torch.zeros(1)), ("ut_params", object()), ("renderer_config", object()),
+     ("render_mode", "RGB-d"), ("camera_model", "ftheta"), ("rasterize_mode", "smooth")],
+)  # fmt: skip
+def test_what_is_not_offered_is_refused_by_name(name, value):
+    with pytest.raises(InputError, match=name):
+        rasterization(**scene_of(), **SIZE, **{name: value})
+
+
+def test_wrong_shapes_are_named():
+    arguments = scene_of()
+    for name in ("means", "quats", "opacities", "viewmats", "Ks", "colors"):
+        with pytest.raises(ValueError, match=name if name != "means" else "quats|opacities|means"):
+            rasterization(
+                **arguments | {name: arguments[name][..., :-1, :] if name != "opacities" else torch.ones(3)}, **SIZE
+            )
+    with pytest.raises(ValueError, match="colors"):
+        rasterization(**arguments | {"colors": None}, **SIZE)
+    with pytest.raises(ValueError, match="sh_degree=5"):
+        rasterization(**arguments | {"colors": torch.zeros(40, 36, 3).double()}, **SIZE, sh_degree=5)
+
+
+# ---- gsplat 1.5.3, where it is installed -----------------------------------------------------------------------------
+
+
+@with_gsplat
+@pytest.mark.parametrize("camera_model", ["pinhole", "ortho", "fisheye"])
+@pytest.mark.parametrize("calc_compensations", [False, True])
+@pytest.mark.parametrize("batch", [(), (2,), (1, 2)])
+def test_projection_of_gsplat(device, batch, calc_compensations, camera_model):
+    from gsplat.cuda import _torch_impl as gsplat
+
+    arguments = scene_of(batch, n=80)
+    covars, _ = gsplat._quat_scale_to_covar_preci(arguments["quats"], arguments["scales"], True, False, triu=False)
+    radii, *pairs, compensations = gsplat._fully_fused_projection(
+        arguments["means"], covars, arguments["viewmats"], arguments["Ks"], 45, 37,
+        calc_compensations=calc_compensations, camera_model=camera_model,
+    )  # fmt: skip
+    moved = {name: x.to(device) for name, x in arguments.items()}
+    mode = "antialiased" if calc_compensations else "classic"
+    moved["opacities"] = torch.full_like(moved["opacities"], 0.97)
+    *_, meta = rasterization(**moved, **SIZE, camera_model=camera_model, rasterize_mode=mode, packed=False)
+    seen = ((radii > 0) & (meta["radii"].cpu() > 0)).all(-1)
+    assert seen.sum() > 20 and ((radii > 0).all(-1) ^ seen).double().mean() < 0.1  # radii there ignore opacity
+    tolerance = 1e-6 if camera_model == "fisheye" else "projection_float64"  # an epsilon is added to the radius there
+    for name, expected in zip(("means2d", "depths", "conics"), pairs, strict=True):
+        assert_close_relative_to_max(meta[name].cpu()[seen], expected[seen], tolerance, name)
+    if calc_compensations:
+        assert_close_relative_to_max(meta["opacities"].cpu()[seen], 0.97 * compensations[seen], tolerance)
+
+
+@with_gsplat
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("absgrad", [False, True])
+def test_default_strategy_of_gsplat(absgrad, packed):
+    from gsplat.strategy import DefaultStrategy
+
+    scene = scene_of(n=60, cameras=2, dtype=torch.float32)
+    params = {
+        "means": scene["means"],
+        "quats": scene["quats"],
+        "scales": scene["scales"].log(),
+        "opacities": torch.logit(scene["opacities"]),
+        "colors": torch.logit(scene["colors"].clamp(0.1, 0.9)),
+    }
+    params = torch.nn.ParameterDict({name: torch.nn.Parameter(x.clone()) for name, x in params.items()})
+    optimizers = {name: torch.optim.Adam([x], lr=0.01) for name, x in params.items()}
+    strategy = DefaultStrategy(
+        refine_start_iter=2,
+        refine_every=5,
+        reset_every=20,
+        grow_grad2d=2e-3,
+        absgrad=absgrad,
+        pause_refine_after_reset=0,
+    )
+    strategy.check_sanity(params, optimizers)
+    state, target, losses, counts = strategy.initialize_state(), torch.rand(2, 37, 45, 3), [], []
+    for step in range(25):
+        color, _, info = rasterization(
+            params["means"], params["quats"], params["scales"].exp(), params["opacities"].sigmoid(),
+            params["colors"].sigmoid(), scene["viewmats"], scene["Ks"], **SIZE, packed=packed, absgrad=absgrad,
+        )  # fmt: skip
+        strategy.step_pre_backward(params, optimizers, state, step, info)
+        loss = (color - target).abs().mean()
+        loss.backward()
+        for optimizer in optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad()
+        strategy.step_post_backward(params, optimizers, state, step, info, packed=packed)
+        losses.append(loss.item()), counts.append(len(params["means"]))
+    assert len(set(counts)) > 1 and min(losses[-5:]) < losses[0]
