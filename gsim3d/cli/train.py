@@ -43,7 +43,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--export", metavar="FILE", help="also write the result as one .safetensors file")
     parser.add_argument("--tensorboard", action="store_true", help="also log to OUT/tensorboard, with sample videos")
     parser.add_argument("--wandb", action="store_true", help="also log for Weights & Biases, as its own settings say")
-    parser.add_argument("--viewer", action="store_true", help="show a sample prediction, anew at each checkpoint")
+    parser.add_argument(
+        "--viewer", action="store_true", help="show how a held-out scene is predicted, anew at each checkpoint"
+    )
     parser.add_argument("--profile", action="store_true", help="write a trace of two steps to OUT/profile, then go on")
     parser.add_argument("--print-config", action="store_true", help="print all settings with their defaults and exit")
 
@@ -67,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
             raise InputError(f"{'CONFIG' if name == 'config' else f'--{name}'} is needed (see gsim3d train --help)")
     if args.export:
         output_path(args.export, ".safetensors", "--export")
-    folders, _ = split_scenes(find_scenes(args.data))
+    folders, held_out = split_scenes(find_scenes(args.data))
     refuse_held_out(folders)
     names = ("cache", "device", "until", "export", "tensorboard", "wandb", "profile")
     options = {name: getattr(args, name) for name in names}
@@ -75,5 +77,6 @@ def run(args: argparse.Namespace) -> int:
     from gsim3d.train.run import train
     from gsim3d.viewer.training import showing_samples
 
-    train(config, folders, args.out, **options, viewer=showing_samples if args.viewer else None)
+    viewer = showing_samples if args.viewer else None
+    train(config, folders, args.out, **options, viewer=viewer, held_out=held_out)
     return 0

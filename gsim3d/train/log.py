@@ -87,9 +87,13 @@ class Log:
             try:
                 yield
             finally:
-                for logger in filter(None, (self.board, self.wandb)):
+                for logger in self._loggers:
                     logger.close()
                 self.board = self.wandb = self._stream = None
+
+    @property
+    def _loggers(self) -> list[Board | Wandb]:
+        return [logger for logger in (self.board, self.wandb) if logger is not None]
 
     def write(self, entry: dict, machine: dict) -> None:
         """Writes ``entry``, which follows from the configuration, and time and memory, which do not."""
@@ -102,7 +106,7 @@ class Log:
                 raise InputError(
                     f"{self.file}: cannot be written: {error.strerror}; free some space and train again"
                 ) from None
-            for logger in filter(None, (self.board, self.wandb)):
+            for logger in self._loggers:
                 logger.scalars(dict(_numbers({**entry, **machine}, "train")), entry["step"])
 
 

@@ -133,6 +133,7 @@ class Trainer:
         tensorboard: bool = False,
         wandb: bool = False,
         watch: Callable[[Sample, int], None] | None = None,
+        watched: Scene | None = None,
         profile: bool = False,
     ) -> None:
         """Trains to the end of the configuration, or to optimizer step ``until``, and saves there.
@@ -144,6 +145,7 @@ class Trainer:
             tensorboard: also log for TensorBoard, with a sample video at each checkpoint.
             wandb: also log for Weights & Biases.
             watch: called by the first process with a sample and the step, before the first step and at each checkpoint.
+            watched: scene of that sample; None: the first one.
             profile: write a trace of two steps.
         Raises:
             NumericalError: ``optimizer.max_skipped`` steps in a row were skipped; the message says what to do.
@@ -165,7 +167,7 @@ class Trainer:
         with lock, bar, deterministic(), log, tracer, signals as self._signals:
             stops = self.step >= until
             if watch is not None:
-                watch(self.draw_sample(), self.step)
+                watch(self.draw_sample(watched), self.step)
             while not stops:
                 start = time.perf_counter()
                 entry = self.train_step()
@@ -184,7 +186,10 @@ class Trainer:
                 stops = self.step == until or time.monotonic() >= end or self._stop is not None
                 if self.step % self.config.checkpoint_every == 0 or stops:
                     self.save()
-                    self._show(watch)
+                    if self.log.board is not None:
+                        self.log.board.video(sample_video(self.simulator, self.plan, self.draw_sample()), self.step)
+                    if watch is not None:
+                        watch(self.draw_sample(watched), self.step)
         self.processes.check_same(weights=self.parameters.values())  # all wait until the first one has saved
         if self._stop is not None and self.step < until:
             why, code = self._stop
@@ -396,20 +401,10 @@ class Trainer:
         watch.report.close()  # what the backward pass computes again would be counted twice
         return images
 
-    def draw_sample(self) -> Sample:
-        """What is predicted of the first window of the first scene now."""
+    def draw_sample(self, scene: Scene | None = None) -> Sample:
+        """What is predicted of the first window of ``scene``, or of the first scene, now."""
         phase, _ = self.config.phase_of(max(0, min(self.step, self.config.n_steps) - 1))
-        return draw_sample(self.simulator, self.plan, self.scenes[0], self.config.data, phase, self.device)
-
-    def _show(self, watch: Callable[[Sample, int], None] | None) -> None:
-        """A sample for those that look on."""
-        if self.log.board is None and watch is None:
-            return
-        sample = self.draw_sample()
-        if self.log.board is not None:
-            self.log.board.video(sample_video(self.simulator, self.plan, sample), self.step)
-        if watch is not None:
-            watch(sample, self.step)
+        return draw_sample(self.simulator, self.plan, scene or self.scenes[0], self.config.data, phase, self.device)
 
     # ---- checkpoints ----
 

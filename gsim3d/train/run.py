@@ -16,6 +16,7 @@ from gsim3d.train.config import TrainConfig
 from gsim3d.train.log import Sample
 from gsim3d.train.loop import Trainer
 from gsim3d.train.processes import joined
+from gsim3d.train.samples import check_scenes
 
 
 def train(
@@ -30,6 +31,7 @@ def train(
     tensorboard: bool = False,
     wandb: bool = False,
     viewer: Callable[[], AbstractContextManager[Callable[[Sample, int], None]]] | None = None,
+    held_out: Sequence[Path] = (),
     profile: bool = False,
 ) -> None:
     """Trains on the scenes in ``folders`` and writes the run folder ``out``.
@@ -42,6 +44,7 @@ def train(
         tensorboard: also log to OUT/tensorboard.
         wandb: also log for Weights & Biases.
         viewer: opens what is to be called with samples, see :meth:`gsim3d.train.loop.Trainer.run`.
+        held_out: scenes that are not trained on; the viewer shows the first, or without any one of ``folders``.
         profile: write a trace of two steps to OUT/profile.
     Raises:
         InputError: scenes do not fit the settings, or the memory is full.
@@ -59,10 +62,14 @@ def train(
                 "" if trainer.same_scenes else "; its scenes have changed, so the curve is another one from here on"
             )
             report(f"going on from step {trainer.step} of {config.n_steps}{changed}")
+        watched = None
+        if viewer and held_out:
+            watched = Scene.open(held_out[0], cache_dir=cache, fitting=config.data.fitting)
+            check_scenes([trainer.scenes[0], watched], config.data, config.phases)
         options = {"until": until, "tensorboard": tensorboard, "wandb": wandb, "profile": profile}
         try:
-            with viewer() if viewer and processes.is_first else nullcontext() as watch:
-                trainer.run(**options, watch=watch)
+            with viewer() if viewer else nullcontext() as watch:
+                trainer.run(**options, watch=watch, watched=watched)
         except (RuntimeError, MemoryError) as error:
             if not is_out_of_memory(error):
                 raise

@@ -292,7 +292,8 @@ class Target:
         """
         if self.gaussians(0) is None:
             raise InputError(f"{self.name} holds no Gaussians that could be written to {path}")
-        return write_frames(path, (self.seen(frame, layers) for frame in frames), len(frames), fps=self.fps)
+        seen = (self.seen(frame, layers) for frame in frames)
+        return write_frames(path, (one for one in seen if one is not None), len(frames), fps=self.fps)
 
     def views(self, frame: int, cams: Sequence[int]) -> list[View]:
         """Cameras ``cams`` of the scene at a frame."""

@@ -97,6 +97,7 @@ class Simulation:
         about = {"name": "state", "fps": restored.fps or 24.0}
         if isinstance(source, Scene):
             inputs = restored.simulator.inputs
+            assert inputs is not None  # of what was trained
             frames = source.input_frames(inputs, start=start)
             with torch.no_grad():
                 state = restored.simulator.encode(

@@ -11,6 +11,7 @@ import urllib.request
 import pytest
 import torch
 
+from gsim3d.data import Scene
 from gsim3d.errors import InputError
 from gsim3d.io import checkpoint
 from gsim3d.io.settings import from_dict
@@ -219,12 +220,17 @@ def test_viewer_shows_each_sample_and_changes_no_bit(folder, tmp_path, capsys):
         def watch(sample, step):
             show(sample, step)
             shown.append((step, sample.particles.n_clouds, sample.n_given))
+            assert sample.scene is others
 
-        Trainer(config, scenes(folder), tmp_path / "with").run(progress=False, until=5, watch=watch)
+        others = Scene.open(scenes(folder)[1].path)
+        Trainer(config, scenes(folder), tmp_path / "with").run(progress=False, until=5, watch=watch, watched=others)
         address = re.search(r"viewer: (http://127.0.0.1:\d+)", capsys.readouterr().out)[1]
         with urllib.request.urlopen(address) as answer:
             assert answer.status == 200
     assert curve(tmp_path / "without") == curve(tmp_path / "with")
+    second = Trainer(config, scenes(folder), tmp_path / "second")
+    second.processes.rank = 1
+    second.run(progress=False, until=1, watch=lambda *_: pytest.fail("only the first process shows samples"))
     assert [step for step, *_ in shown] == [0, 2, 4, 5] and shown[0][1:] == (1, 1) and shown[-1][1:] == (4, 2)
 
 
