@@ -13,7 +13,7 @@ SPEC.loader.exec_module(sizes)
 TODAY = {
     "lines of the package": 38_800,
     "lines of the library without io": 14_150,
-    "lines of readers, writers and the viewer": 4_440,
+    "lines of readers, writers and the viewer": 4_480,
 }
 
 

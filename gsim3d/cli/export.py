@@ -18,6 +18,7 @@ examples:
   gsim3d export runs/ball --frame -1 --to ball.spz        the last one
   gsim3d export runs/ball --to ball.mp4 --size 720        a film from an orbiting camera, with the time
   gsim3d export garden.ply --to orbit.mp4                 once around a single frame, in six seconds
+  gsim3d export runs/ball --scene data/elastic/ball/0000 --to ball.html    truth beside prediction; also .mp4
   gsim3d export garden.ply --to garden.splat
 """
 
@@ -37,9 +38,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     turns = "of a video's camera (default 0.25; 1 around a single frame)"
     parser.add_argument("--turns", type=number(-1e3, 1e3), help=turns)
 
+    parser.add_argument("--scene", metavar="SCENE", help="recorded scene that TARGET predicts: truth beside it")
+    parser.add_argument("--start", type=whole(0), default=0, help="step of SCENE that is shown first (default 0)")
+    parser.add_argument("--camera", type=whole(0), default=0, metavar="CAM", help="of SCENE (default 0)")
+
 
 def run(args: argparse.Namespace) -> int:
+    from gsim3d.errors import InputError
+    from gsim3d.viewer.comparison import export_comparison
     from gsim3d.viewer.export import export
 
-    print(export(**vars(args)))
+    given = dict(vars(args))
+    own = {name: given.pop(name) for name in ("scene", "start", "camera")}
+    if args.scene is None and (args.start or args.camera):
+        raise InputError("--start and --camera belong to --scene")
+    if args.scene is None:
+        print(export(**given))
+        return 0
+    if args.frame is not None or args.up_to or args.turns is not None:
+        raise InputError("--frame, --up-to and --turns do not go with --scene: its camera sees every frame")
+    print(export_comparison(args.target, args.to, fps=args.fps, up=args.up, **own))
     return 0

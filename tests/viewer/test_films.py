@@ -4,10 +4,13 @@ import cv2
 import numpy as np
 import pytest
 
+from gsim3d.cli.main import main
+from gsim3d.data import Scene
 from gsim3d.io.formats import write_splats
 from gsim3d.viewer.export import export
 from gsim3d.viewer.films import ACCENT, film_frames
-from tests.viewer.test_player import make
+from tests.tiny_scenes import write_scene
+from tests.viewer.test_player import make, unpacked
 
 ORANGE = np.array(ACCENT)
 
@@ -68,3 +71,45 @@ def test_export_writes_the_time_into_videos(tmp_path):
     video = cv2.VideoCapture(str(tmp_path / "a.mp4"))
     first, second = (video.read()[1].astype(int) for _ in range(2))
     assert np.abs(first - second)[:28, -80:].max() > 60 and np.abs(first - second)[40:].max() < 60
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return write_scene(tmp_path_factory.mktemp("data") / "ball" / "0000", size=32)
+
+
+def test_export_shows_the_truth_beside_what_was_predicted(scene, tmp_path, capsys):
+    (tmp_path / "run").mkdir()
+    for step in range(2):
+        write_splats(tmp_path / "run" / f"step_{step}.ply", make())
+    arguments = ["export", str(tmp_path / "run"), "--scene", str(scene), "--start", "1", "--camera", "1"]
+    assert main([*arguments, "--to", str(tmp_path / "a.mp4"), "--fps", "7"]) == 0
+    assert "2 frames, 7 a second, truth beside prediction" in capsys.readouterr().out
+    frame = cv2.VideoCapture(str(tmp_path / "a.mp4")).read()[1][..., ::-1]
+    assert frame.shape == (1028, 512, 3)
+    recorded = Scene.open(scene).images(range(3), range(4)).permute(1, 0, 3, 4, 2).numpy()  # [V, S, H, W, 3]
+    small = cv2.resize(frame[:512], (32, 32), interpolation=cv2.INTER_AREA).astype(int)
+    errors = np.abs(small - recorded)[:, :, 4:].mean((2, 3, 4))  # below the labels
+    assert np.unravel_index(errors.argmin(), errors.shape) == (1, 1) and errors.min() < 10
+    assert frame[560:].max() > 60
+    assert main([*arguments, "--to", str(tmp_path / "a.html")]) == 0
+    header, _ = unpacked((tmp_path / "a.html").read_text())
+    assert len(header["truth"]) == 2 and header["view"]["width"] == 32
+
+
+@pytest.mark.parametrize(
+    "arguments, says",
+    [
+        (["--scene", "SCENE", "--to", "b.spz"], "write .mp4 or .html"),
+        (["--scene", "SCENE", "--camera", "99", "--to", "b.mp4"], "--camera 99"),
+        (["--scene", "SCENE", "--start", "99", "--to", "b.mp4"], "--start 99"),
+        (["--scene", "SCENE", "--turns", "1", "--to", "b.mp4"], "do not go with --scene"),
+        (["--camera", "1", "--to", "b.mp4"], "belong to --scene"),
+    ],
+)
+def test_export_refuses_what_does_not_go_with_a_scene(arguments, says, scene, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_splats("a.ply", make())
+    arguments = [str(scene) if one == "SCENE" else one for one in arguments]
+    assert main(["export", "a.ply", *arguments]) == 2 and says in capsys.readouterr().err
+    assert not list(tmp_path.glob("b.*"))

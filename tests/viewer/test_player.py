@@ -15,6 +15,7 @@ import torch
 from gsim3d.cameras import Cameras
 from gsim3d.errors import InputError
 from gsim3d.evaluate.metrics import psnr
+from gsim3d.math.rotations import rotate_left
 from gsim3d.math.spherical_harmonics import SH_0
 from gsim3d.ops import rasterize_gaussians
 from gsim3d.state import Gaussians
@@ -149,7 +150,8 @@ def test_player_file_size_of_16k_gaussians(tmp_path):
     for step in range(80):
         height = abs(((step / 20 + 1) % 2) - 1) ** 2
         shift = torch.linalg.cross(spin * step, first.means) + torch.tensor([0.003 * step, 0, height])
-        frames.append(dataclasses.replace(first, means=first.means + shift))
+        quats = rotate_left(first.quats, spin * step)
+        frames.append(dataclasses.replace(first, means=first.means + shift, quats=quats))
     write_player(tmp_path / "a.html", frames, fps=42)
     assert (tmp_path / "a.html").stat().st_size <= 8e6
 
