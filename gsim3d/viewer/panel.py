@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsim3d.effects.selection import KINDS
+from gsim3d.errors import InputError
 from gsim3d.state import FROZEN
 from gsim3d.viewer.simulation import OPERATIONS, Simulation, Switch, hit
 
@@ -74,11 +75,12 @@ class SimulationPanel:
         self._which.value = chosen
         self._place()
 
-    def forget(self) -> None:
-        """Lists bodies anew when a frame is shown next: particles have changed."""
-        self._frame = -1
+    def _check_paused(self) -> None:
+        if self._viewer.timeline.playing:
+            raise InputError("pause at the frame that is meant first")
 
     def _choose(self) -> None:
+        self._check_paused()
         if self._which.value in KINDS:
             return
         rows = self._bodies[self._which.options.index(self._which.value) - len(KINDS)]
@@ -119,6 +121,7 @@ class SimulationPanel:
     # What is done
 
     def _simulate(self) -> None:
+        self._check_paused()
         corners = None
         if self._inside.value:
             middle, half = np.array(self._middle.value), np.abs(self._sides.value) / 2

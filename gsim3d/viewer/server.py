@@ -193,7 +193,6 @@ class Viewer:
         with self._lock:
             self.timeline.pause()
             self._simulation.simulate_on(self.timeline.frame, n_steps, operations)
-            self._panel.forget()
             self._frames_changed()
 
     def _frames_changed(self) -> None:

@@ -33,7 +33,7 @@ def showing_samples() -> Iterator[Callable[[Sample, int], None]]:
             return
         try:
             if viewers:
-                viewers[0].show(*_frames(sample), f"step {step}")
+                viewers[0].show(*_frames(sample), f"training step {step}")
                 return
             particles, frames = _frames(sample)
             scene, about = sample.scene, {"scene": sample.scene, "n_encoded": sample.n_given}

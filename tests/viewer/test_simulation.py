@@ -152,6 +152,7 @@ def test_panel_edits_the_body_that_is_chosen(viser, simulation, name, kind):
         color = body_color(simulation, 3, rows)
         panel._simulate()
         assert viewer.timeline.n_frames == 5 and "ms a simulated step" in viewer._status.content
+        assert panel._which.value.startswith("body 1") and panel._inside.value  # to try again with another vector
         (edit,) = simulation.edits
         assert isinstance(edit.operation, kind) and edit.step == 1 and edit.operation.of.box is not None
         if name == "move":
@@ -188,6 +189,10 @@ def test_a_click_chooses_a_body_or_the_background_until_another_frame_is_shown(v
         assert panel._which.value == "frozen" and not panel._inside.value
         panel._pick(types.SimpleNamespace(ray_origin=(50.0, 0.0, 50.0), ray_direction=(0.0, 0.0, 1.0)))
         assert panel._which.value == "frozen"
+        viewer.timeline.play()
+        for act in (panel._choose, panel._simulate):
+            with pytest.raises(InputError, match="pause"):
+                act()
 
 
 def test_panel_shows_what_effects_cost(viser, simulation):
