@@ -35,7 +35,7 @@ class ProximityConfig(PriorConfig):
 
 class Proximity(Prior, config=ProximityConfig):
     """Features p u and p of each movable particle, with the vector u to the background in units of ``range`` and the
-    proximity p = exp(-|u|^2 / 2). No gradients."""
+    proximity ``p = exp(-|u|^2 / 2)``. No gradients."""
 
     n_features, reads_background = 4, True
 
