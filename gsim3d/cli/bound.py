@@ -1,4 +1,4 @@
-"""``gsim3d bound``: what a perfect simulator scores."""
+"""``gsim3d bound``: the score of a perfect simulator."""
 
 from __future__ import annotations
 
@@ -7,37 +7,39 @@ import argparse
 from gsim3d.cli.arguments import whole
 
 EPILOG = """\
-The scenes of a set that gsim3d generate made are simulated again, with errors in how bodies start that images leave
-open, and rendered exactly:
+Simulates and renders the scenes of a generated set again, with errors in the initial state of bodies that input images
+do not determine:
 
-  elastic, cloth   velocity 0.42 mm a step, position 2 mm, angle 10 mrad
-  rigid            velocity 1 mm a step, spin 3 %
+  elastic, cloth   velocity 0.42 mm/step, position 2 mm, angle 10 mrad
+  rigid            velocity 1 mm/step, spin 3 %
 
-All of the last of the four given steps, of this length and in random directions. "one" is the PSNR of one such
-simulation over all later steps and cameras, masked (without background) and of bodies; "mean of 4" that of the mean
-image of four. --given adds the squared error of a model's given steps, which a perfect simulator would keep.
+The errors have these magnitudes at the last of the four input steps, and random directions. "one" is the PSNR of one
+simulation over all later steps and cameras, masked (without background) and on bodies; "mean of 4" that of the mean
+image of four. --given adds the squared error of a model's input steps, which a perfect simulator would retain.
 
 examples:
   gsim3d bound data/elastic --trajectories 24
   gsim3d bound data/elastic --given 34.4
   gsim3d bound data/elastic --given runs/model/metrics.json --out runs/bound
 
-With --out it may be killed at any time: run it again and it goes on where it stopped.
+With --out, an interrupted command continues when it is run again.
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "What a perfect simulator scores that sees the start of a scene as well as images show it."
+    parser.description = "Scores a perfect simulator whose initial state has the uncertainty of the input images."
     parser.epilog = EPILOG
-    parser.add_argument("set", metavar="SET", help="data set that gsim3d generate made")
+    parser.add_argument("set", metavar="SET", help="data set of gsim3d generate")
     parser.add_argument(
         "--given",
         metavar="DB|FILE",
-        help="a model's error of given steps: masked PSNR in dB, or metrics.json of gsim3d evaluate",
+        help="a model's error of the input steps: masked PSNR in dB, or metrics.json of gsim3d evaluate",
     )
-    parser.add_argument("--trajectories", type=whole(1), metavar="N", help="the first N of the set (default: all)")
-    parser.add_argument("--out", metavar="DIR", help="folder for bound.json and what each scene gave")
-    parser.add_argument("--processes", type=whole(1), metavar="N", help="default: one a core")
+    parser.add_argument("--trajectories", type=whole(1), metavar="N", help="number of trajectories (default: all)")
+    parser.add_argument("--out", metavar="DIR", help="folder for bound.json and the errors of each scene")
+    parser.add_argument(
+        "--processes", type=whole(1), metavar="N", help="number of processes (default: number of cores)"
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
 
 

@@ -1,4 +1,4 @@
-"""`gsim3d generate`: make a data set of multi-view video."""
+"""`gsim3d generate`: generates a data set of multi-view videos."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from gsim3d.cli.arguments import number, whole
 EPILOG = """\
 worlds:
   elastic   soft bodies fall on a round ground
-  rigid     rigid bodies are thrown on it
-  cloth     soft bodies fall on a cloth that hangs from its four corners
+  rigid     rigid bodies are thrown on a round ground
+  cloth     soft bodies fall on a cloth with four fixed corners
 
 examples:
   gsim3d generate elastic --out data/mini                      34 short scenes at 128 pixels
@@ -20,31 +20,31 @@ examples:
   gsim3d generate elastic --out data/seven --mesh genesis:dragon
 
 presets (--preset):
-  published six bodies, each of one look, size and material; a plain ground; 1200 trajectories, as long as the paper's
+  published six bodies with fixed looks, size and material; a plain ground; 1200 trajectories of the paper's length
   mini      the same with 24 frames and 34 trajectories (default)
-  diverse   pattern, colours, size, material and spin are drawn for every trajectory; a ground of three colours
+  diverse   random pattern, colours, size, material and spin for every trajectory; a ground of three colours
 
 sets (--set), with the preset's cameras:
-  train     what models learn from
-  unseen    shapes that no training set has: cross, dumbbell, knot, pyramid
+  train     training data
+  unseen    shapes that are in no training set: cross, dumbbell, knot, pyramid
   several   two or three bodies (diverse rigid: four or five; cloth: two)
   no-ground bodies are thrown up and fall freely, recorded for 0.7 s (elastic, rigid)
-  raised    the ground lies 15 to 30 cm higher (elastic, rigid)
-  higher    from greater heights
+  raised    the ground is 15 to 30 cm higher (elastic, rigid)
+  higher    larger drop heights
 
 layout:
   DIR/<object>/<sample>/metadata.json                  cameras (world-to-camera, pixels), fps, near, far, origin
   DIR/<object>/<sample>/cam_<j>/rgb_<step>.png         colour
                                /seg_<step>.png         0 background, 1 ground, 3 bodies and cloth
                                /inst_<step>.png        0 background, 1 ground, 2 and more: each body, the cloth last
-                               /depth_<step>.png       16 bits, 0.1 mm along the camera's axis, 0: nothing (--depth)
-  DIR/<object>/<sample>/states.npz                     what carries each body and the cloth at every step, metres
+                               /depth_<step>.png       16 bits, 0.1 mm along the optical axis, 0: background (--depth)
+  DIR/<object>/<sample>/states.npz                     nodes of each body and of the cloth at every step, metres
   DIR/manifest.json                                    options, hashes, rejected draws, machine, versions
-  DIR/effects.yaml                                     what these scenes call for (gsim3d plan)
+  DIR/effects.yaml                                     effects of the scenes (gsim3d plan)
 
-The same options give the same bytes for any number of processes. It may be killed at any time: run it again and
-it goes on where it stopped. A larger --trajectories adds scenes to a finished set. On many machines, each with
---part I/N and then one without: tools/slurm/generate.sbatch.
+The same options give the same bytes for any number of processes. An interrupted command continues when it is run
+again. A larger --trajectories adds scenes to a finished set. For many machines, run --part I/N on each, and then once
+without it: tools/slurm/generate.sbatch.
 """
 
 LENGTH = number(0, above=True)  # metres
@@ -54,15 +54,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Simulates falling bodies and records them with calibrated cameras on two rings."
     parser.epilog = EPILOG
     add, lengths = parser.add_argument, {"type": LENGTH, "nargs": 2, "metavar": ("LOW", "HIGH")}
-    add("world", metavar="WORLD", help="what is simulated: elastic, rigid or cloth")
-    add("--out", metavar="DIR", required=True, help="folder of the data set; made if absent, continued if unfinished")
+    add("world", metavar="WORLD", help="elastic, rigid or cloth")
+    add("--out", metavar="DIR", required=True, help="folder of the data set; created or continued")
     add("--preset", default="mini", help="options to start from: mini (default), published or diverse")
     add("--set", dest="subset", metavar="NAME", help="train (default), or a held-out set, see below")
     add("--size", dest="image_size", type=whole(16, 4096), metavar="PX", help="width and height of the images")
     add("--frames", dest="n_frames", type=whole(1), metavar="N", help="steps of a trajectory")
     add("--fps", type=number(0, above=True), help="steps a second")
-    add("--trajectories", dest="n_trajectories", type=whole(1), metavar="N", help="scenes, dealt to objects in turn")
-    add("--seed", type=whole(0), help="another seed gives other trajectories (default 0)")
+    add(
+        "--trajectories",
+        dest="n_trajectories",
+        type=whole(1),
+        metavar="N",
+        help="number of scenes, assigned to objects in turn",
+    )
+    add("--seed", type=whole(0), help="random seed (default 0)")
     objects = "ball,blob,box,capsule,cone,cylinder,ellipsoid,spot,star,torus"
     add("--objects", type=_names, metavar="A,B", help=f"{objects} (default: those of the preset), or none")
     add(
@@ -70,10 +76,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         dest="meshes",
         action="append",
         metavar="FILE",
-        help="a mesh as one more object, with its texture, or genesis:NAME (duck, dragon, worm, bunny ...) of an "
-        "installed genesis-world; repeatable",
+        help="an additional object: a mesh file with its texture, or genesis:NAME (duck, dragon, worm, bunny ...) of "
+        "an installed genesis-world; repeatable",
     )
-    add("--mesh-up", choices=("y", "z"), help="which axis of mesh files points up (default y)")
+    add("--mesh-up", choices=("y", "z"), help="axis of mesh files that points up (default y)")
     add("--drop", dest="drop_height", help="range of drop heights, metres", **lengths)
     add("--body-size", help="range of body diameters, metres", **lengths)
     add("--background", choices=("black", "white"), help="colour behind the ground (default black)")
@@ -81,13 +87,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--camera-spread",
         type=number(0, 0.25),
         metavar="S",
-        help="cameras differ from scene to scene: up to S of their distance nearer or farther, other heights and "
-        "angles (default 0: the same in all)",
+        help="varies the cameras between scenes: distance by a factor of 1 +- S, heights and angles in proportion "
+        "(default 0: equal cameras)",
     )
     add("--depth", action="store_true", default=None, help="also write depth images")
     add("--engine", help="mujoco (default), or genesis: the paper's MPM and PBD (pip install 'gsim3d[genesis]')")
-    add("--processes", type=whole(1), metavar="N", help="default: one a core")
-    part = "make only the I-th of N parts of the scenes, beside other parts; the same call without it ends the set"
+    add("--processes", type=whole(1), metavar="N", help="number of processes (default: number of cores)")
+    part = "generate the I-th of N parts of the scenes; a call without it then completes the set"
     add("--part", type=_part, metavar="I/N", help=part)
     add("--quiet", action="store_true", help="no progress bar")
 
@@ -110,7 +116,7 @@ def run(args: argparse.Namespace) -> int:
     options = {k: tuple(v) if isinstance(v, list) else v for k, v in vars(args).items() if v is not None}
     report = generate(options.pop("out"), options.pop("world"), progress=not options.pop("quiet"), **options)
     kept = len(report.folders) - report.n_made
-    print(f"{len(report.folders)} scenes in {args.out}: {report.n_made} made, {kept} already there")
+    print(f"{len(report.folders)} scenes in {args.out}: {report.n_made} generated, {kept} kept")
     for reason, count in sorted(report.rejected.items()):
-        print(f"  {count} draws rejected and drawn again: {reason}")
+        print(f"  {count} draws rejected: {reason}")
     return 0

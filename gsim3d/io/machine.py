@@ -5,16 +5,20 @@ from __future__ import annotations
 import hashlib
 import platform
 from pathlib import Path
-
-import torch
+from typing import TYPE_CHECKING
 
 import gsim3d
+
+if TYPE_CHECKING:
+    import torch
 
 PACKAGE = Path(gsim3d.__file__).parent
 
 
 def machine(device: torch.device) -> dict[str, str]:
     """Versions, device and processor of a measurement. "sources" is a hash of the package's Python files."""
+    import torch  # not above: workers that generate data run without torch
+
     found = {
         "gsim3d": gsim3d.__version__,
         "sources": _hash_of_sources(),

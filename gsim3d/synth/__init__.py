@@ -1,4 +1,4 @@
-"""Physics scenes seen by many cameras: data to train and test a simulator on (MuJoCo moves, Embree draws)."""
+"""Synthetic data: multi-view videos of physics scenes, simulated by MuJoCo and ray-traced by Embree."""
 
 from gsim3d.synth.run import Report, generate
 from gsim3d.synth.worlds import HELD_OUT, PRESETS, WORLDS

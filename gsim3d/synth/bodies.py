@@ -17,9 +17,9 @@ from gsim3d.synth.mesh_files import SUFFIXES
 ASSETS = Path(__file__).parent / "assets"
 MESH_BODIES = {"spot": ASSETS / "spot.obj"}
 OBJECTS = (*shapes.SHAPES, *MESH_BODIES)
-GENESIS = "genesis:"  # begins names of meshes of the package genesis-world
+GENESIS = "genesis:"  # prefix of meshes of the package genesis-world
 
-# Friction and bounce of rigid bodies whose properties are functions of their names.
+# Friction and bounce of rigid bodies, for worlds in which they depend on the name only.
 CONTACTS = {
     "box": (0.6, 0.3),
     "capsule": (0.5, 0.4),
@@ -31,12 +31,12 @@ CONTACTS = {
 
 
 def name_rng(name: str) -> np.random.Generator:
-    """A generator of random numbers that depend on ``name`` only."""
+    """Random generator seeded by ``name``."""
     return np.random.default_rng(zlib.crc32(name.encode()))
 
 
 def named_body(name: str, rng: np.random.Generator) -> shapes.Body:
-    """The body called ``name``, one of OBJECTS; ``rng`` draws the pattern and colours of procedural ones."""
+    """Returns the body ``name`` of OBJECTS; ``rng`` draws pattern and colours of procedural bodies."""
     if name in MESH_BODIES:
         return _mesh_body(name)
     if name not in shapes.SHAPES:
@@ -50,36 +50,36 @@ def _mesh_body(name: str) -> shapes.Body:
 
 
 def mesh_name(text: str) -> str:
-    """Name of the body whose mesh is ``text``: a file, or ``genesis:NAME``."""
+    """Name of the body of a mesh: a file, or ``genesis:NAME``."""
     return text.removeprefix(GENESIS) if text.startswith(GENESIS) else Path(text).stem
 
 
 def load_mesh(text: str, up: str = "y") -> shapes.Body:
-    """The body of a mesh file, or of a mesh of an installed genesis-world, ``genesis:NAME``, whose holes are filled."""
+    """Loads a mesh file, or a mesh ``genesis:NAME`` of an installed genesis-world, whose holes are filled."""
     return _genesis_body(_genesis_folder(text), text, up)[1] if text.startswith(GENESIS) else meshes.load_body(text, up)
 
 
 def mesh_bytes(text: str, up: str = "y") -> bytes:
-    """The content of the file that :func:`load_mesh` reads."""
+    """Content of the file that :func:`load_mesh` reads."""
     file = _genesis_body(_genesis_folder(text), text, up)[0] if text.startswith(GENESIS) else Path(text)
     return file.read_bytes()
 
 
 def _genesis_folder(text: str) -> Path:
-    """The meshes of genesis-world, which is not imported. Raises InputError when it is not installed."""
+    """Folder of the meshes of genesis-world, found without importing it. Raises InputError if it is not installed."""
     spec = find_spec("genesis")
     for root in (spec and spec.submodule_search_locations) or ():
         if (folder := Path(root) / "assets" / "meshes").is_dir():
             return folder
     raise InputError(
-        f"mesh {text} is a file of the package genesis-world, which is not installed: "
-        "pip install --no-deps genesis-world==1.4.5 (84 MB; nothing of it is executed)"
+        f"mesh {text} needs the package genesis-world: "
+        "pip install --no-deps genesis-world==1.4.5 (84 MB; none of its code is executed)"
     )
 
 
 @cache
 def _genesis_body(folder: Path, text: str, up: str) -> tuple[Path, shapes.Body]:
-    """The first mesh that can be read in the subfolder that ``text`` names, else beside the subfolders."""
+    """First readable mesh in the subfolder of the name in ``text``, or in the folder itself, and its body."""
     names: dict[str, list[Path]] = {}
     for file in sorted(folder.rglob("*"), key=lambda file: (-len(file.parts), file)):
         if file.suffix.lower() in SUFFIXES:
@@ -96,7 +96,7 @@ def _genesis_body(folder: Path, text: str, up: str) -> tuple[Path, shapes.Body]:
 
 
 def named_contact(name: str, friction: tuple[float, float], bounce: tuple[float, float]) -> tuple[float, float]:
-    """Friction and bounce of the body called ``name``: of CONTACTS, else drawn in these ranges, always the same."""
+    """Friction and bounce of the body ``name``: from CONTACTS, else drawn from these ranges, seeded by the name."""
     if name in CONTACTS:
         return CONTACTS[name]
     rng = name_rng(name)

@@ -12,11 +12,11 @@ class Rig:
     """The cameras of a scene.
 
     Attributes:
-        viewmats: [V, 4, 4] world-to-camera, OpenCV axes (x right, y down, z forward).
-        Ks: [V, 3, 3] pixels, pixel centres at +0.5.
-        size: width and height of the images, pixels.
-        near: metres, the smallest depth of what is visible.
-        far: metres, the largest.
+        viewmats: world-to-camera matrices [V, 4, 4], OpenCV axes (x right, y down, z forward).
+        Ks: intrinsics [V, 3, 3] in pixels, pixel centres at +0.5.
+        size: width and height of the images in pixels.
+        near: smallest visible depth in metres.
+        far: largest visible depth in metres.
     """
 
     viewmats: np.ndarray
@@ -32,7 +32,7 @@ class Rig:
 
 
 def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """World-to-camera matrix [4, 4] of a camera at ``position`` that looks at ``target``, world z up in the image."""
+    """World-to-camera matrix [4, 4] of a camera at ``position`` that looks at ``target``, with world z up."""
     forward = target - position
     forward = forward / np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -45,15 +45,18 @@ def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def two_rings(n_cams, size, near, far, *, distance, target_height, elevations, fov, turned=0.0) -> Rig:
-    """``n_cams`` cameras on two rings, low and high in turn, all ``distance`` metres from the point they look at.
+    """Cameras on two rings, alternately low and high, that look at a point on the z axis.
 
     Args:
-        n_cams, size, near, far: as of Rig.
-        distance: metres.
-        target_height: metres, of the point on the vertical axis that they look at.
-        elevations: (low, high) degrees above the horizon.
-        fov: vertical field of view, degrees.
-        turned: radians, of both rings about the vertical.
+        n_cams: number of cameras.
+        size: width and height of the images in pixels.
+        near: smallest visible depth in metres.
+        far: largest visible depth in metres.
+        distance: distance from the target in metres.
+        target_height: height of the target in metres.
+        elevations: (low, high) elevation in degrees.
+        fov: vertical field of view in degrees.
+        turned: rotation of both rings about the z axis in rad.
     """
     target = np.array([0.0, 0.0, target_height])
     focal = size / 2 / np.tan(np.radians(fov) / 2)
@@ -67,7 +70,7 @@ def two_rings(n_cams, size, near, far, *, distance, target_height, elevations, f
 
 
 def project(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels [V, N, 2] and depths [V, N] of world points [N, 3] in every camera."""
+    """Projects world points [N, 3] to pixels [V, N, 2] and depths [V, N] of every camera."""
     local = np.einsum("vij,nj->vni", viewmats[:, :3, :3], points) + viewmats[:, None, :3, 3]
     image = np.einsum("vij,vnj->vni", Ks, local)
     return image[..., :2] / image[..., 2:], local[..., 2]
@@ -77,7 +80,7 @@ def pixel_rays(rig: Rig, samples: int) -> tuple[np.ndarray, np.ndarray]:
     """Rays through ``samples`` x ``samples`` points of every pixel.
 
     Returns:
-        Origins [V, 3] and unit directions [V, H, W, samples^2, 3] in the world.
+        Origins [V, 3] and unit directions [V, H, W, samples^2, 3] in world coordinates.
     """
     steps = (np.arange(samples) + 0.5) / samples
     grid = np.arange(rig.size)[:, None] + steps[None]
@@ -95,9 +98,9 @@ def pixel_rays(rig: Rig, samples: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def workspace_origin(rig: Rig) -> np.ndarray:
-    """Lower corner [3] of the box around all camera frusta between near and far, rounded down to 0.1 m.
+    """Lower corner [3] of the bounding box of all camera frusta between near and far, rounded down to 0.1 m.
 
-    No pixel of any camera at any depth in range lies below it, so voxels counted from it are never negative.
+    Cell indices relative to it are never negative.
     """
     corner = np.array([[x, y] for x in (0.0, rig.size) for y in (0.0, rig.size)])
     lowest = []

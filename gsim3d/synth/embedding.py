@@ -1,4 +1,4 @@
-"""Embeddings of surfaces: nodes that an engine moves, and points that are tied to them at frame 0."""
+"""Embeddings of surfaces: nodes that an engine moves, and surface points bound to them at frame 0."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-NEIGHBOURS = 12  # particles that carry a point; four that span space are enough for an affine motion
+NEIGHBOURS = 12  # particles that a point is bound to; an affine motion needs four in general position
 
 
 @dataclass(frozen=True)
@@ -15,14 +15,14 @@ class Binding:
 
     Attributes:
         corners: int64 [N, K], indices of the flattened nodes.
-        weights: [N, K], whose sums are 1; outside of what the nodes span some are negative.
+        weights: [N, K], rows sum to 1; some are negative for points outside the convex hull of the nodes.
     """
 
     corners: np.ndarray
     weights: np.ndarray
 
     def move(self, nodes: np.ndarray) -> np.ndarray:
-        """The points [N, 3] of moved ``nodes`` [..., 3]."""
+        """Points [N, 3] for the positions ``nodes`` [..., 3]."""
         nodes = nodes.reshape(-1, 3)
         points = np.zeros((len(self.corners), 3))
         for corner in range(self.corners.shape[1]):
@@ -35,18 +35,18 @@ class ControlGrid:
     """Control grid of a soft body.
 
     Attributes:
-        nodes: [T, c+1, c+1, c+1, 3] metres, world; frame 0 is an axis-aligned box of equal cells.
-        occupied: bool [c, c, c], cells that hold collision vertices and whose corners all move with the body; nodes of
-            other cells drift freely or stay behind.
+        nodes: [T, c+1, c+1, c+1, 3], world coordinates in metres; frame 0 is an axis-aligned box of equal cells.
+        occupied: bool [c, c, c], cells with collision vertices whose corners all move with the body. Nodes of other
+            cells are not simulated.
     """
 
     nodes: np.ndarray
     occupied: np.ndarray
 
     def bind(self, points: np.ndarray) -> Binding:
-        """Ties ``points`` [N, 3] at frame 0 to the nearest occupied cell each.
+        """Binds ``points`` [N, 3] at frame 0 to their nearest occupied cells, by trilinear weights.
 
-        Weights extrapolate where a point lies outside, so a rigid motion of the grid moves every point rigidly.
+        Weights extrapolate outside a cell, so a rigid motion of the grid moves all points rigidly.
         """
         rest = self.nodes[0]
         n = rest.shape[0] - 1
@@ -69,13 +69,13 @@ class RigidFrame:
     """Axes of a rigid body.
 
     Attributes:
-        nodes: [T, 4, 3] metres, world: its origin and the tips of its three unit axes.
+        nodes: [T, 4, 3], origin and tips of the three unit axes, world coordinates in metres.
     """
 
     nodes: np.ndarray
 
     def bind(self, points: np.ndarray) -> Binding:
-        """Ties ``points`` [N, 3] at frame 0 to the axes."""
+        """Binds ``points`` [N, 3] at frame 0 to the axes."""
         axes = self.nodes[0, 1:] - self.nodes[0, 0]
         local = ((points - self.nodes[0, 0])[:, None] * axes).sum(-1)
         corners = np.broadcast_to(np.arange(4), (len(points), 4))
@@ -87,13 +87,13 @@ class ClothGrid:
     """Grid of a cloth.
 
     Attributes:
-        nodes: [T, n, n, 3] metres, world, of a square grid.
+        nodes: square grid [T, n, n, 3], world coordinates in metres.
     """
 
     nodes: np.ndarray
 
     def refine(self, times: int) -> Binding:
-        """A grid ``times`` x finer, smooth and through all nodes (Catmull-Rom along both axes), row by row."""
+        """Binds a grid that is ``times`` finer, by Catmull-Rom interpolation along both axes; row-major points."""
         n = self.nodes.shape[1]
         weights = _catmull_rom(n, times)
         m = len(weights)
@@ -103,7 +103,7 @@ class ClothGrid:
 
 
 def _catmull_rom(n: int, times: int) -> np.ndarray:
-    """Weights [(n - 1) * times + 1, n] of a curve through n equal knots; past its ends it goes on straight."""
+    """Catmull-Rom weights [(n - 1) * times + 1, n] for n uniform knots, with linear extrapolation at the ends."""
     position = np.arange((n - 1) * times + 1) / times
     first = np.minimum(position.astype(np.int64), n - 2)
     t = position - first
@@ -119,7 +119,7 @@ def _catmull_rom(n: int, times: int) -> np.ndarray:
 
 
 def grid_faces(n: int) -> np.ndarray:
-    """Triangles [2 (n-1)^2, 3] of a grid of n x n vertices, facing +z where rows run along x and columns along y."""
+    """Triangles [2 (n-1)^2, 3] of a grid of n x n vertices, facing +z if rows run along x and columns along y."""
     i, j = (a.reshape(-1) for a in np.meshgrid(np.arange(n - 1), np.arange(n - 1), indexing="ij"))
     a, b, c, d = i * n + j, (i + 1) * n + j, (i + 1) * n + j + 1, i * n + j + 1
     return np.stack([np.stack([a, b, c], 1), np.stack([a, c, d], 1)], 1).reshape(-1, 3)
@@ -130,15 +130,15 @@ class ParticleCloud:
     """Particles of a body.
 
     Attributes:
-        nodes: [T, P, 3] metres, world.
+        nodes: [T, P, 3], world coordinates in metres.
     """
 
     nodes: np.ndarray
 
     def bind(self, points: np.ndarray) -> Binding:
-        """Ties ``points`` [N, 3] at frame 0 to the nearest particles, near ones weighing most.
+        """Binds ``points`` [N, 3] at frame 0 to their nearest particles.
 
-        The weights reproduce every affine motion of the particles exactly, rigid ones too.
+        The weights decrease with distance, and reproduce affine motions exactly.
         """
         rest = self.nodes[0]
         count = min(NEIGHBOURS, len(rest))
@@ -146,7 +146,7 @@ class ParticleCloud:
         arms = rest[corners] - points[:, None]
         near = 1 / ((arms**2).sum(-1) + 1e-12 + (arms**2).sum(-1).mean(1, keepdims=True) / count)
         design = np.concatenate([np.ones((*arms.shape[:2], 1)), arms], 2)
-        # Smallest weights, measured by distance, that add up to 1 and to the point itself.
+        # Weights of smallest distance-weighted norm that sum to 1 and reproduce the point.
         normal = np.einsum("nki,nk,nkj->nij", design, near, design)
         multiplier = np.einsum("nij,j->ni", np.linalg.pinv(normal, hermitian=True), [1.0, 0, 0, 0])
         return Binding(corners, near * np.einsum("nki,ni->nk", design, multiplier))

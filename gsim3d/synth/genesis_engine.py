@@ -1,7 +1,6 @@
-"""Motion by Genesis, as the paper made its data: MPM for soft bodies, PBD for cloth; needs the package genesis-world.
+"""Simulation with Genesis, as in the paper: MPM for soft bodies, PBD for cloth. Needs the package genesis-world.
 
-Surfaces are embedded in the particles of their bodies. Bits repeat on one machine and device only as far as Genesis
-repeats them, which its GPU atomics do not promise.
+Surfaces are embedded in the particles of their bodies. Genesis does not guarantee equal bits in repeated runs.
 """
 
 from __future__ import annotations
@@ -15,22 +14,22 @@ from gsim3d.synth.embedding import ClothGrid, ParticleCloud, grid_faces
 from gsim3d.synth.meshes import enclosed_volume
 from gsim3d.synth.scene_setup import GRAVITY, Cloth, SceneSetup, SoftBody, Unstable
 
-TIMESTEP, SUBSTEPS = 1e-3, 20  # seconds, and parts of it: the paper's
+TIMESTEP, SUBSTEPS = 1e-3, 20  # of the paper; time step in seconds
 GRID_DENSITY = 64  # cells a metre
 POISSON = 0.2
 GROUND_RADIUS, GROUND_DEPTH = 2.0, 0.1
-DOMAIN = 2.0  # metres along x and y, and above the highest point of a body, that particles may reach
-FIX_DISTANCE = 1e-3  # metres between a corner of the cloth and its particle
+DOMAIN = 2.0  # half extent of the domain along x and y, and its height over the highest body, in metres
+FIX_DISTANCE = 1e-3  # largest distance in metres between a node of the cloth and its particle
 
 
 def simulate(setup: SceneSetup, n_frames: int, fps: float, max_timestep: float) -> list[ParticleCloud | ClothGrid]:
-    """The embedding of each body at every frame, and of the cloth last.
+    """Simulates a scene. Returns the embedding of each body over all frames, and of the cloth last.
 
     Args:
-        setup: with soft bodies only.
-        n_frames, fps: as they are kept.
-        max_timestep: not used; the paper's time step is.
-
+        setup: scene with soft bodies only.
+        n_frames: number of frames.
+        fps: frames a second.
+        max_timestep: not used; the time step is TIMESTEP.
     Raises:
         Unstable: particles are not finite.
     """
@@ -64,7 +63,7 @@ def simulate(setup: SceneSetup, n_frames: int, fps: float, max_timestep: float) 
 
 
 def _build(gs, setup: SceneSetup, folder: Path):
-    """Scene, soft entities and cloth entity (or None), built."""
+    """Builds the scene. Returns scene, soft entities and cloth entity (or None)."""
     top = max(float(body.vertices[:, 2].max()) for body in setup.bodies)
     low = setup.ground if setup.ground is not None else -DOMAIN
     lower, upper = (-DOMAIN, -DOMAIN, low - GROUND_DEPTH), (DOMAIN, DOMAIN, top + DOMAIN)
@@ -108,12 +107,12 @@ def _add_cloth(gs, scene, cloth: Cloth, path: Path):
 
 
 def _pin(entity, cloth: Cloth) -> np.ndarray:
-    """Fixes the four corners; returns the particle of every node of the grid, row by row."""
+    """Fixes the four corners. Returns the particle of every node of the grid, in row-major order."""
     nodes, positions = cloth.rest_nodes().reshape(-1, 3), _positions(entity)
     distance = np.linalg.norm(nodes[:, None] - positions[None], axis=-1)
     order = distance.argmin(1)
     if distance.min(1).max() > FIX_DISTANCE:
-        raise RuntimeError("Genesis has made other particles of the cloth than the vertices of its mesh")
+        raise RuntimeError("the particles of the cloth differ from the vertices of its mesh in this version of Genesis")
     n = cloth.count
     entity.fix_particles(order[[0, n - 1, n * (n - 1), n * n - 1]])
     return order

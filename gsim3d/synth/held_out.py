@@ -1,4 +1,4 @@
-"""The sets that models are scored on: trajectories with seeds of their own, which training leaves out."""
+"""Held-out sets for model selection and test scores: trajectories with reserved seeds."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from gsim3d.errors import InputError
 from gsim3d.synth.world import TRAIN
 from gsim3d.synth.worlds import TEST_SEED, VALIDATION_SEED, WORLDS
 
-# name -> seed and number of trajectories. Models are chosen on the first; the second is scored once a release.
+# name -> seed and number of trajectories. "validation" selects models; "test" is scored once a release.
 SETS = {"validation": (VALIDATION_SEED, 24), "test": (TEST_SEED, 56)}
 
 
 @dataclass(frozen=True)
 class Origin:
-    """How `gsim3d generate` made a scene.
+    """Generator options of a scene.
 
     Attributes:
-        world: elastic, rigid or cloth.
-        subset: of the held-out kinds of scenes; None: as in training.
-        seed: of the set.
-        body: name of its object.
+        world: "elastic", "rigid" or "cloth".
+        subset: held-out variant of the world; None: the training variant.
+        seed: seed of the set.
+        body: name of the object.
     """
 
     world: str
@@ -39,7 +39,7 @@ class Origin:
 
 
 def origin_of(folder: Path) -> Origin | None:
-    """The origin of the scene in ``folder``; None where `gsim3d generate` did not make it."""
+    """Generator options of the scene in ``folder``; None for other scenes."""
     try:
         metadata = read_json(folder / "metadata.json")
     except (InputError, OSError):
@@ -51,20 +51,20 @@ def origin_of(folder: Path) -> Origin | None:
 
 
 def refuse_held_out(folders: Sequence[Path]) -> None:
-    """Raises InputError where one of the scenes, which training would see, is of a set that models are scored on."""
+    """Raises InputError if a training scene belongs to a held-out set."""
     for folder in folders:
         if (origin := origin_of(folder)) and origin.set_name:
             raise InputError(
-                f"{folder}: of the {origin.set_name} set (seed {origin.seed}), which no training may see; generate "
-                "trajectories with another --seed"
+                f"{folder}: a scene of the {origin.set_name} set (seed {origin.seed}), which is held out; generate "
+                "training data with another --seed"
             )
 
 
 def set_of(folders: Sequence[Path]) -> dict | None:
-    """Which generated set the scenes are of; None: of several, or not of `gsim3d generate`.
+    """Description of the generated set of the scenes; None if they are of several sets or not generated.
 
     Returns:
-        name ("validation", "test" or None), world, subset, seed, bodies (number of trajectories of each).
+        "name" ("validation", "test" or None), "world", "subset", "seed" and "bodies" (body -> number of trajectories).
     """
     first, bodies = None, Counter()
     for folder in folders:
@@ -81,7 +81,7 @@ def set_of(folders: Sequence[Path]) -> dict | None:
 
 
 def describe_set(found: dict) -> str:
-    """One sentence on what :func:`set_of` returned."""
+    """The output of :func:`set_of` as a sentence."""
     n_trajectories, counts = sum(found["bodies"].values()), sorted(set(found["bodies"].values()))
     each = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
     of = f"{found['world']} ({found['subset']})" if found["subset"] else found["world"]
@@ -89,5 +89,5 @@ def describe_set(found: dict) -> str:
     if found["name"] is None:
         return f"Neither the validation nor the test set: {text}."
     whole = SETS[found["name"]][1]
-    part = "" if n_trajectories == whole or found["subset"] else f"; all of it are {whole}"
+    part = "" if n_trajectories == whole or found["subset"] else f"; the whole set has {whole}"
     return f"{found['name'].capitalize()} set: {text}{part}."

@@ -1,6 +1,6 @@
-"""Triangles of mesh files and their colours: every object and material, or an error that names what is not read.
+"""Readers of mesh files: triangles and colours of all objects and materials, without silent losses.
 
-Wavefront files are parsed here, because trimesh drops materials, colours and lines that it cannot use without an error.
+OBJ files are parsed here, since trimesh silently drops materials, colours and lines that it does not support.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from gsim3d.errors import InputError
 from gsim3d.io.files import read_file
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
-MAX_MESH, MAX_TEXTURE = 1 << 28, 1 << 28  # bytes of a file
-SLOTS = 3  # numbers a corner that a piece's colour needs at most
+MAX_MESH, MAX_TEXTURE = 1 << 28, 1 << 28  # largest file in bytes
+SLOTS = 3  # largest number of channels of a corner
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,9 @@ class Piece:
     """Triangles of one material.
 
     Attributes:
-        triangles: [F, 3, 3] positions.
-        corners: [F, 3, C], input of ``paint`` at the corners of a face; None: no colour.
-        paint: [N, C] -> colours [N, 3] in [0, 1]; None: no colour.
+        triangles: positions [F, 3, 3].
+        corners: input of ``paint`` at the corners of each face [F, 3, C]; None: no colour.
+        paint: function [N, C] -> colours [N, 3] in [0, 1]; None: no colour.
     """
 
     triangles: np.ndarray
@@ -37,20 +37,20 @@ class Piece:
 
 
 def read_pieces(path: Path) -> list[Piece]:
-    """All triangles of a mesh file, a piece for each material.
+    """Reads all triangles of a mesh file, one piece for each material.
 
     Raises:
-        InputError: the file cannot be read, or holds colours that are not read; the message says which.
+        InputError: the file cannot be read, or has colours of an unsupported kind.
     """
     if path.suffix.lower() not in SUFFIXES:
-        raise InputError(f"mesh {path}: files that end in {', '.join(SUFFIXES)} are read")
+        raise InputError(f"mesh {path}: the supported formats are {', '.join(SUFFIXES)}")
     data = read_file(path, MAX_MESH)
     pieces = _read_obj(path, data) if path.suffix.lower() == ".obj" else _read_other(path, data)
     return [piece for piece in pieces if len(piece.triangles)]
 
 
 def texture_lookup(image: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Bilinear, repeating texture; v counts from the bottom row, as in .obj files."""
+    """Bilinear, repeating texture lookup; v starts at the bottom row, as in OBJ files."""
     texels = image.astype(np.float64) / 255
     height, width = texels.shape[:2]
 
@@ -67,7 +67,7 @@ def texture_lookup(image: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def joined_paint(pieces: list[Piece]) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-    """Corners [F, 3, C] and paint of all pieces together; the first number of a corner is the index of its piece."""
+    """Joins the corners [F, 3, C] and paints of all pieces; the first channel of a corner is the index of its piece."""
     if len(pieces) == 1:
         return pieces[0].corners, pieces[0].paint
     widths = [piece.corners.shape[2] for piece in pieces]
@@ -97,9 +97,6 @@ def _image(data: bytes, what: str) -> np.ndarray:
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
     except Exception as error:  # PIL raises whatever its decoders raise
         raise InputError(f"{what} cannot be decoded: {' '.join(str(error).split())[:200]}") from None
-
-
-# ---- Wavefront .obj ----
 
 
 def _read_obj(path: Path, data: bytes) -> list[Piece]:
@@ -204,13 +201,10 @@ def _read_mtl(path: Path, file: Path) -> dict[str, np.ndarray | None]:
 
 
 def _vertex_colours(triangles: np.ndarray, colours: np.ndarray, path: Path) -> Piece:
-    """Colours [F, 3, 3] from 0 to 1, or to 255 where any is above 1."""
+    """Piece with vertex colours [F, 3, 3] in [0, 1], or in [0, 255] if any is above 1."""
     if not (colours >= 0).all() or not (colours <= 255).all():
-        raise InputError(f"mesh {path}: colours of vertices must lie from 0 to 1, or to 255")
+        raise InputError(f"mesh {path}: vertex colours must be in [0, 1] or in [0, 255]")
     return Piece(triangles, colours / (255 if (colours > 1).any() else 1), lambda corners: corners)
-
-
-# ---- everything else, by trimesh ----
 
 
 def _read_other(path: Path, data: bytes) -> list[Piece]:
@@ -218,9 +212,9 @@ def _read_other(path: Path, data: bytes) -> list[Piece]:
 
     kind, start = path.suffix.lower(), data[:4096]
     if kind == ".off" and _has_off_colours(data):
-        raise InputError(f"mesh {path} has colours, which are not read from OFF files: save it as PLY or OBJ")
+        raise InputError(f"mesh {path} has colours, which are not supported in OFF files: save it as PLY or OBJ")
     if kind == ".stl" and b"COLOR=" in start[:80]:
-        raise InputError(f"mesh {path} has colours, which are not read from STL files: save it as PLY or OBJ")
+        raise InputError(f"mesh {path} has colours, which are not supported in STL files: save it as PLY or OBJ")
     try:
         scene = trimesh.load_scene(path, process=False)
         nodes = [(scene.graph[node][0], scene.geometry[scene.graph[node][1]]) for node in scene.graph.nodes_geometry]
@@ -228,12 +222,12 @@ def _read_other(path: Path, data: bytes) -> list[Piece]:
         raise InputError(f"mesh {path} cannot be read: {' '.join(str(error).split())[:200]}") from error
     pieces = [_of_trimesh(mesh, matrix, path) for matrix, mesh in nodes if isinstance(mesh, trimesh.Trimesh)]
     if kind == ".ply" and b"TextureFile" in start and any(piece.corners is None for piece in pieces):
-        raise InputError(f"mesh {path} names a texture that is not beside it, or has no coordinates in it")
+        raise InputError(f"mesh {path} has a texture that is missing, or has no texture coordinates")
     return pieces
 
 
 def _has_off_colours(data: bytes) -> bool:
-    """Whether an OFF file is a COFF, or any face has numbers behind its corners."""
+    """Whether an OFF file is a COFF, or a face has numbers after its vertices."""
     lines = [line.split(b"#")[0].split() for line in data.splitlines()]
     lines = [words for words in lines if words]
     if not lines or lines[0][0] != b"OFF":
@@ -249,12 +243,12 @@ def _has_off_colours(data: bytes) -> bool:
 
 
 def _of_trimesh(mesh, matrix: np.ndarray, path: Path) -> Piece:
-    """``mesh`` moved by the matrix ``matrix`` [4, 4]."""
+    """Piece of ``mesh`` transformed by ``matrix`` [4, 4]."""
     faces, vertices = np.asarray(mesh.faces, dtype=np.int64), np.asarray(mesh.vertices, dtype=np.float64)
     if not np.array_equal(matrix, np.eye(4)):
         vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
     if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
-        raise InputError(f"mesh {path} cannot be read: a face names a vertex that it does not have")
+        raise InputError(f"mesh {path} cannot be read: a face has an invalid vertex index")
     triangles = vertices[faces]
     visual = mesh.visual
     if visual.kind == "vertex":
@@ -271,9 +265,9 @@ def _of_trimesh(mesh, matrix: np.ndarray, path: Path) -> Piece:
     colours = visual.vertex_attributes.get("color")
     if image is not None:
         if visual.uv is None:
-            raise InputError(f"mesh {path} has a texture, but no coordinates in it")
+            raise InputError(f"mesh {path} has a texture, but no texture coordinates")
         if colours is not None:
-            raise InputError(f"mesh {path} has a texture and colours of vertices on it; keep one of them")
+            raise InputError(f"mesh {path} has a texture and vertex colours; keep one of them")
         lookup = texture_lookup(np.asarray(image.convert("RGB")))
         return Piece(triangles, np.asarray(visual.uv, dtype=np.float64)[faces], lambda uv: factor * lookup(uv))
     if colours is not None:

@@ -1,4 +1,4 @@
-"""Bodies from mesh files, with their textures, and the light meshes and convex pieces that collide."""
+"""Bodies from mesh files with textures, and their collision meshes and convex pieces."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from gsim3d.errors import InputError
 from gsim3d.synth.mesh_files import Piece, joined_paint, read_pieces
 from gsim3d.synth.shapes import PALETTE, PATTERNS, Body, normalise
 
-COLLISION_VERTICES = 300  # a mesh file is clustered to at most about so many vertices for contacts
-NEARLY_CONVEX = 0.06  # of the body's size: hollows that are no deeper are filled by the hull that collides
-SLAB_CELLS = 4  # along the longest side of a body's box; hollows of a quarter of the body stay hollow
-SLAB_THICKNESS = 0.04  # of the body's size
+COLLISION_VERTICES = 300  # approximate largest number of vertices of a collision mesh
+NEARLY_CONVEX = 0.06  # depth of concavities, over the body's size, below which the convex hull collides
+SLAB_CELLS = 4  # cells along the longest side of a concave body, each with its own convex piece
+SLAB_THICKNESS = 0.04  # over the body's size
 
 
 def cluster(vertices: np.ndarray, faces: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndarray]:
-    """Merges vertices that share a cell of a grid, the finest that leaves at most ``limit`` of them."""
+    """Merges vertices in the same cell of the finest grid that leaves at most ``limit`` vertices."""
     for n_cells in range(64, 1, -2):
         cells = np.floor((vertices + 0.5) * n_cells).astype(np.int64)
         _, first, label = np.unique(cells, axis=0, return_index=True, return_inverse=True)
@@ -34,18 +34,18 @@ def cluster(vertices: np.ndarray, faces: np.ndarray, limit: int) -> tuple[np.nda
 
 
 def load_body(path: str | Path, up: str = "y", *, fill_holes: bool = False) -> Body:
-    """A body from a mesh file (:data:`gsim3d.synth.mesh_files.SUFFIXES`): all its objects, with their textures and
-    colours; a pattern where it has none.
+    """Loads all objects of a mesh file with textures and colours (:data:`gsim3d.synth.mesh_files.SUFFIXES`).
 
-    Copies of a vertex along texture seams are merged by position; the surface must be closed then.
+    Parts without colours get a pattern. Copies of a vertex along texture seams are merged by position; the surface
+    must then be closed.
 
     Args:
-        path: mesh file; material files and textures that it names must lie beside it.
-        up: "y" (usual for .obj and .glb) or "z", the axis that points up in the file.
-        fill_holes: close each border of the surface by a fan of triangles around its middle.
+        path: mesh file, with its material files and textures in the same folder.
+        up: axis that points up in the file: "y" (usual for .obj and .glb) or "z".
+        fill_holes: closes each hole by a fan of triangles around its center.
 
     Raises:
-        InputError: the file cannot be read, holds no closed surface or a face twice, or colours are lost.
+        InputError: the file cannot be read, the surface is not closed or has duplicate faces, or colours are lost.
     """
     path = Path(path)
     if not path.is_file():
@@ -58,10 +58,10 @@ def load_body(path: str | Path, up: str = "y", *, fill_holes: bool = False) -> B
         triangles = triangles[:, :, [0, 2, 1]] * [1, -1, 1]
     centre, diameter = normalise(triangles.reshape(-1, 3))
     if not diameter > 0:
-        raise InputError(f"mesh {path} has no size: all vertices coincide")
+        raise InputError(f"mesh {path} has zero size: all vertices coincide")
     triangles = (triangles - centre) / diameter
     corners, paint = joined_paint(_with_patterns(pieces, triangles))
-    # One vertex for each position: copies along texture seams would tear the shading and collide twice.
+    # One vertex for each position: copies along texture seams would break smooth shading and collide twice.
     positions, label = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
     faces = label.reshape(-1, 3)
     proper = (faces != np.roll(faces, 1, axis=1)).all(1)
@@ -71,19 +71,18 @@ def load_body(path: str | Path, up: str = "y", *, fill_holes: bool = False) -> B
     _, uses = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True)
     if not len(faces) or (uses % 2).any():
         raise InputError(
-            f"mesh {path} is not closed: {int((uses % 2).sum())} edges have a face on one side only, also after "
-            "vertices at the same position are merged; fill its holes"
+            f"mesh {path} is not closed: {int((uses % 2).sum())} edges have a face on one side only; fill its holes"
         )
     n_different = len(np.unique(np.sort(faces, axis=1), axis=0))
     if n_different < len(faces):
-        raise InputError(f"mesh {path} holds {len(faces) - n_different} faces twice; remove the copies")
+        raise InputError(f"mesh {path} has {len(faces) - n_different} duplicate faces; remove them")
     inwards = _turned_inwards(positions, faces)
     faces[inwards], corners[inwards] = faces[inwards, ::-1], corners[inwards, ::-1]
     return Body(path.stem, positions, faces, *cluster(positions, faces, COLLISION_VERTICES), corners, paint)
 
 
 def _with_patterns(pieces: list[Piece], triangles: np.ndarray) -> list[Piece]:
-    """``pieces``; those without colours get a pattern, which depends on the positions of ``triangles``."""
+    """Gives pieces without colours a pattern, a function of the positions ``triangles``."""
     colors, found, begin = PALETTE[[5, 8, 1]], [], 0
     for piece in pieces:
         end = begin + len(piece.triangles)
@@ -95,7 +94,7 @@ def _with_patterns(pieces: list[Piece], triangles: np.ndarray) -> list[Piece]:
 
 
 def _filled(positions: np.ndarray, faces: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Positions, faces and corners of a surface whose borders, chains of edges with one face, are closed by fans."""
+    """Closes holes, loops of edges with a single face, by fans. Returns positions, faces and corners."""
     sides = [[0, 1], [1, 2], [2, 0]]
     edges, ends = faces[:, sides].reshape(-1, 2), corners[:, sides].reshape(-1, 2, corners.shape[2])
     _, label, uses = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
@@ -112,7 +111,7 @@ def _filled(positions: np.ndarray, faces: np.ndarray, corners: np.ndarray) -> tu
 
 
 def _components(n: int, cells: np.ndarray) -> np.ndarray:
-    """int [n]: for each vertex the lowest one that it is connected with by ``cells`` [C, K], vertices each."""
+    """Connected components of n vertices: lowest connected vertex, int [n]. ``cells`` [C, K] connect K vertices."""
     label, before = np.arange(n), None
     while before is None or (label != before).any():
         before = label.copy()
@@ -122,7 +121,7 @@ def _components(n: int, cells: np.ndarray) -> np.ndarray:
 
 
 def _turned_inwards(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """bool [F], faces of bodies that are turned inside out; a cavity inside a body is turned with the body."""
+    """bool [F], faces of parts that are inside out; a cavity is oriented with its body."""
     bodies, body = np.unique(_components(len(positions), faces)[faces[:, 0]], return_inverse=True)
     volume = np.bincount(body, _volumes(positions, faces), len(bodies))
     inverted = volume.sum() < 0
@@ -131,26 +130,26 @@ def _turned_inwards(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
     np.maximum.at(high, body, positions[faces].max(1))
     turned = np.full(len(bodies), inverted)
     for k in np.flatnonzero(volume < 0 if not inverted else volume > 0):
-        if ((low <= low[k]) & (high >= high[k])).all(1).sum() == 1:  # in no other body
+        if ((low <= low[k]) & (high >= high[k])).all(1).sum() == 1:  # not inside another part
             turned[k] = not inverted
     return turned[body]
 
 
 def _volumes(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """[F], whose sum is six times the volume that faces turned outwards enclose."""
+    """Signed volumes [F] of the tetrahedra of faces and origin, times six."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return (a * np.cross(b, c)).sum(1)
 
 
 def enclosed_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Volume that a closed surface encloses; negative where its faces are turned inwards."""
+    """Signed volume of a closed surface; negative if its faces point inwards."""
     return float(_volumes(vertices, faces).sum()) / 6
 
 
 def convex_pieces(vertices: np.ndarray, faces: np.ndarray) -> list[np.ndarray]:
-    """Vertices of convex bodies that together cover the surface, for engines that collide convex bodies only.
+    """Vertices of convex pieces that cover the surface, for engines with convex collision shapes.
 
-    One piece, the hull, where the body is nearly convex; otherwise a slab of the surface for each cell of a grid.
+    One piece, the hull, if the body is nearly convex; otherwise a slab of the surface for each cell of a grid.
     """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     normals = np.cross(b - a, c - a)
@@ -168,7 +167,7 @@ def convex_pieces(vertices: np.ndarray, faces: np.ndarray) -> list[np.ndarray]:
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit normals [V, 3]: the sum of the normals of the faces around each vertex, weighted by their areas."""
+    """Unit vertex normals [V, 3], area-weighted means of the face normals."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     face_normals = np.cross(b - a, c - a)
     normals = np.stack(

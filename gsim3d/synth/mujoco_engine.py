@@ -1,4 +1,4 @@
-"""Motion by MuJoCo: soft bodies are flexes on a control lattice, rigid ones convex pieces, cloth is a flex."""
+"""Simulation with MuJoCo: soft bodies are trilinear flexes, rigid bodies convex meshes, and cloth is a 2D flex."""
 
 from __future__ import annotations
 
@@ -10,26 +10,31 @@ from gsim3d.synth.embedding import ClothGrid, ControlGrid, Embedding, RigidFrame
 from gsim3d.synth.scene_setup import GRAVITY, Cloth, RigidBody, SceneSetup, SoftBody, Unstable
 
 NAME = "mujoco"
-CONTACT_RADIUS = 0.005  # metres around every collision vertex; the ground plane is lowered by it
-CLOTH_RADIUS = 0.012  # around cloth: thin sheets need more, lest vertices meet between its triangles
-CONTACT_TIME = 0.005  # seconds; a slower contact lets a body sink in by centimetres at impact
-MIN_STEPS_PER_CONTACT = 2.0  # MuJoCo's own limit: the contact time spans at least two steps
-RIGID_CONTACT = 300.0  # rad/s of the spring between rigid bodies: at 3 m/s they overlap by a centimetre
+CONTACT_RADIUS = 0.005  # radius of collision vertices in metres; the ground plane is lowered by it
+CLOTH_RADIUS = 0.012  # radius of cloth in metres; larger, so that vertices do not pass between its triangles
+CONTACT_TIME = 0.005  # time constant of contacts in seconds; a longer one allows centimetres of penetration
+MIN_STEPS_PER_CONTACT = 2.0  # limit of MuJoCo: smallest time constant of a contact in steps
+RIGID_CONTACT = 300.0  # frequency of the contact spring of rigid bodies in rad/s; 1 cm of penetration at 3 m/s
 POISSON = 0.3
 
 
 def simulate(setup: SceneSetup, n_frames: int, fps: float, max_timestep: float) -> list[Embedding]:
-    """The embedding of each body at every frame, and of the cloth last, if there is one.
+    """Simulates a scene. Returns the embedding of each body over all frames, and of the cloth last.
 
-    The control grid of a soft body is the bounding box of its collision mesh at time 0.
+    The control grid of a soft body spans the bounding box of its collision mesh at time 0.
 
+    Args:
+        setup: scene at time 0.
+        n_frames: number of frames.
+        fps: frames a second.
+        max_timestep: largest time step in seconds.
     Raises:
-        Unstable: the solver gives up.
+        Unstable: the solver diverges.
     """
     os.environ.setdefault("MUJOCO_GL", "disable")
     import mujoco
 
-    mujoco.set_mju_user_warning(lambda text: None)  # it would write a file into the working directory
+    mujoco.set_mju_user_warning(lambda text: None)  # the default writes a log file to the working directory
     substeps = int(np.ceil(1 / (fps * max_timestep) - 1e-9))
     model = mujoco.MjModel.from_xml_string(model_xml(setup, 1 / (fps * substeps)))
     data = mujoco.MjData(model)
@@ -52,7 +57,7 @@ def simulate(setup: SceneSetup, n_frames: int, fps: float, max_timestep: float) 
 
 
 def model_xml(setup: SceneSetup, timestep: float) -> str:
-    """The scene as a model of MuJoCo."""
+    """MuJoCo model of the scene as XML."""
     contact_time = max(CONTACT_TIME, MIN_STEPS_PER_CONTACT * timestep)
     contact = f'solref="{contact_time:.9g} 1"'
     assets, bodies = [], []
@@ -67,10 +72,10 @@ def model_xml(setup: SceneSetup, timestep: float) -> str:
         height = setup.ground - (CONTACT_RADIUS if soft else 0)
         bodies.append(f'<geom type="plane" size="9 9 .1" pos="0 0 {height:.9g}" {contact}/>')
     if setup.pusher is not None:
-        place, radius = _numbers(setup.pusher.position), f"{setup.pusher.radius:.9g}"
-        geom = f'<geom type="sphere" size="{radius}"/>'  # friction and softness are the pushed body's
-        bodies.append(f'<body name="pusher" mocap="true" pos="{place}">{geom}</body>')
-    iterations = 50 if setup.cloth is None else 100  # a cloth that carries a soft body converges slowly
+        position, radius = _numbers(setup.pusher.position), f"{setup.pusher.radius:.9g}"
+        geom = f'<geom type="sphere" size="{radius}"/>'  # contact parameters are those of the pushed body
+        bodies.append(f'<body name="pusher" mocap="true" pos="{position}">{geom}</body>')
+    iterations = 50 if setup.cloth is None else 100  # slow convergence of soft bodies on a cloth
     return f"""<mujoco>
   <option timestep="{timestep:.12g}" integrator="discrete" iterations="{iterations}" gravity="0 0 {-GRAVITY}"/>
   <size memory="256M"/>
@@ -84,7 +89,7 @@ def _numbers(values) -> str:
 
 
 def _soft_xml(index: int, body: SoftBody, contact: str) -> tuple[str, str]:
-    centre = (body.vertices.min(0) + body.vertices.max(0)) / 2  # the grid always contains the flex's origin
+    centre = (body.vertices.min(0) + body.vertices.max(0)) / 2  # inside the grid
     material = body.material
     lasting = f' yield="{material.yield_strain:.9g}"' if material.yield_strain else ""
     asset = f'<mesh name="m{index}" vertex="{_numbers(body.vertices)}" face="{_numbers(body.faces)}"/>'
@@ -100,7 +105,7 @@ def _soft_xml(index: int, body: SoftBody, contact: str) -> tuple[str, str]:
 
 def _rigid_xml(index: int, body: RigidBody) -> tuple[str, str]:
     centre = _centre(body)
-    # A contact is a damped spring; the damping ratio follows from the part of the speed that half a period leaves.
+    # Damping ratio of the contact spring for the coefficient of restitution after half a period.
     loss = np.log(max(body.bounce, 1e-3))
     ratio = -loss / np.hypot(np.pi, loss)
     contact = f'solref="{-(RIGID_CONTACT**2):.9g} {-2 * ratio * RIGID_CONTACT:.9g}" priority="1"'
@@ -136,7 +141,7 @@ def _flex_id(model, name: str) -> int:
 
 
 def body_nodes(data, body: int) -> np.ndarray:
-    """Origin and tips of the unit axes [4, 3] of a rigid body, metres."""
+    """Origin and tips of the unit axes of a rigid body [4, 3] in metres."""
     origin = data.xpos[body]
     return np.concatenate([origin[None], origin + data.xmat[body].reshape(3, 3).T])
 
@@ -148,7 +153,7 @@ class _Soft:
         self.data, self.body, self.bodies = data, body, model.flex_nodebodyid[first : first + model.flex_nodenum[flex]]
         self.shape = (body.cells + 1,) * 3
         self.rest = _box_grid(body)
-        movable = model.body_dofnum[self.bodies] == 3  # a node without mass is welded to the world
+        movable = model.body_dofnum[self.bodies] == 3  # nodes without mass are welded to the world
         self.occupied = _occupied_cells(body)
         used = np.zeros(self.shape, dtype=bool)
         corners = [tuple(slice(s, s + body.cells) for s in step) for step in np.ndindex(2, 2, 2)]
@@ -157,7 +162,7 @@ class _Soft:
         for corner in corners:
             used[corner] |= self.occupied
         if not used.any() or np.abs(self.nodes() - self.rest)[used].max() > 1e-5:
-            raise RuntimeError("MuJoCo has laid out the nodes of the flex otherwise than by x, y, z")
+            raise RuntimeError("unexpected order of the nodes of a flex in this version of MuJoCo")
         velocity = body.velocity + np.cross(body.spin, self.rest - self.rest[used].mean(0))
         dofs = model.body_dofadr[self.bodies[movable]][:, None] + np.arange(3)
         data.qvel[dofs] = velocity.reshape(-1, 3)[movable]
@@ -173,10 +178,10 @@ class _Rigid:
     def __init__(self, model, data, index: int, body: RigidBody):
         self.data, self.id = data, model.body(f"b{index}").id
         first = model.body_dofadr[self.id]
-        # The velocity of the body's frame; spin turns about the centre of mass, which need not be its origin.
+        # Velocity of the frame's origin; the spin is about the center of mass.
         arm = data.xipos[self.id] - data.xpos[self.id]
         data.qvel[first : first + 3] = body.velocity - np.cross(body.spin, arm)
-        data.qvel[first + 3 : first + 6] = body.spin  # the frame starts unturned, so local axes are the world's
+        data.qvel[first + 3 : first + 6] = body.spin  # the initial frame is aligned with the world
         self.rest = self.nodes()
 
     def nodes(self) -> np.ndarray:
@@ -193,7 +198,7 @@ class _Cloth:
         self.data, self.vertices = data, slice(first, first + model.flex_vertnum[flex])
         self.rest = cloth.rest_nodes()
         if np.abs(self.nodes() - self.rest).max() > 1e-5:
-            raise RuntimeError("MuJoCo has laid out the nodes of the cloth otherwise than by x, y")
+            raise RuntimeError("unexpected order of the nodes of the cloth in this version of MuJoCo")
 
     def nodes(self) -> np.ndarray:
         return self.data.flexvert_xpos[self.vertices].reshape(self.rest.shape).copy()

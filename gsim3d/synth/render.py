@@ -1,7 +1,7 @@
-"""Images of moving bodies over a round ground: ray casting with one light, ambient light and cast shadows.
+"""Ray-traced images of moving bodies on a round ground, with one directional light, ambient light and shadows.
 
-The ground is an exact disc, whose points and colours are computed once a scene. The bodies are triangle meshes in one
-Embree tree a frame, for all cameras.
+The ground is a disc, whose hit points and colours are computed once a scene. The bodies are triangle meshes in one
+Embree scene a frame, for all cameras.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ import numpy as np
 from gsim3d.synth.cameras import Rig, pixel_rays, project
 from gsim3d.synth.meshes import vertex_normals
 
-BACKGROUND, GROUND, BODY = 0, 1, 3  # segmentation ids; 3 is every body that may move
-AMBIENT = 0.42  # light from the sky on a face that looks up; half of it on a face that looks down
+BACKGROUND, GROUND, BODY = 0, 1, 3  # segmentation ids; 3 for all movable bodies
+AMBIENT = 0.42  # ambient light on faces that point up; half of it on faces that point down
 DIFFUSE = 0.68
-SHADOW_OFFSET = 2e-3  # metres along the normal, so that a shadow ray does not meet its own face
+SHADOW_OFFSET = 2e-3  # metres along the normal, against self-shadowing
 LIGHT_DIRECTION = np.array([0.36, 0.24, 0.90]) / np.linalg.norm([0.36, 0.24, 0.90])  # towards the light
-ACROSS_LIGHT = np.linalg.svd(LIGHT_DIRECTION[None])[2][1:]  # two unit vectors that are at right angles to it
+ACROSS_LIGHT = np.linalg.svd(LIGHT_DIRECTION[None])[2][1:]  # two unit vectors orthogonal to it
 GROUND_COLORS = np.array([[0.80, 0.80, 0.76], [0.36, 0.42, 0.48], [0.62, 0.47, 0.36]])
-FIRST_BODY = 2  # instance number of the first body; background and ground have 0 and 1
+FIRST_BODY = 2  # instance id of the first body, after background and ground
 GROUND_RINGS = 4
 GROUND_SECTORS = 12
 
@@ -34,8 +34,8 @@ class View:
         rgb: uint8 [V, H, W, 3].
         segmentation: uint8 [V, H, W]: BACKGROUND, GROUND or BODY.
         instances: uint8 [V, H, W]: BACKGROUND, GROUND, or FIRST_BODY and more.
-        depth: None, or float32 [V, H, W] metres along the camera's axis, mean of the rays that hit what the pixel
-            shows; 0 where that is nothing.
+        depth: float32 [V, H, W], mean depth along the optical axis in metres of the rays that hit the pixel's instance,
+            0 for the background; None: not rendered.
     """
 
     rgb: np.ndarray
@@ -46,13 +46,13 @@ class View:
 
 @dataclass(frozen=True)
 class Surface:
-    """One body to draw.
+    """A body to render.
 
     Attributes:
         faces: [F, 3].
         corners: [F, 3, C], see :class:`gsim3d.synth.shapes.Body`.
-        paint: [N, C] -> colours [N, 3].
-        two_sided: a sheet, seen and shaded from both sides.
+        paint: function [N, C] -> colours [N, 3].
+        two_sided: shades both sides, for sheets.
     """
 
     faces: np.ndarray
@@ -66,9 +66,9 @@ class Ground:
     """A disc around the world's z axis.
 
     Attributes:
-        radius: metres.
-        height: metres.
-        albedo: grey of the whole disc, in [0, 1]; None: rings cut into sectors of three colours.
+        radius: radius in metres.
+        height: height in metres.
+        albedo: uniform grey in [0, 1]; None: a pattern of rings and sectors in three colours.
     """
 
     radius: float
@@ -77,7 +77,7 @@ class Ground:
 
 
 def ground_color(points: np.ndarray, radius: float) -> np.ndarray:
-    """Colour [N, 3] of ground points [N, 3]: rings cut into sectors, with one ring of another colour."""
+    """Colours [N, 3] of ground points [N, 3]: a pattern of rings and sectors."""
     reach = np.hypot(points[:, 0], points[:, 1]) / radius * GROUND_RINGS
     ring = np.floor(reach).astype(np.int64)
     sector = np.floor((np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 1) * GROUND_SECTORS).astype(np.int64)
@@ -87,15 +87,15 @@ def ground_color(points: np.ndarray, radius: float) -> np.ndarray:
 
 
 class Renderer:
-    """Draws bodies on the ground, frame after frame, with all cameras of a rig.
+    """Renders frames of bodies on the ground with all cameras of a rig.
 
     Args:
         rig: cameras.
-        surfaces: the bodies; their instance numbers are 2, 3, ... in this order.
-        ground: or None.
-        background: (3,) colour in [0, 1] where nothing is hit.
+        surfaces: bodies with the instance ids 2, 3, ...
+        ground: ground; None: no ground.
+        background: colour (3,) in [0, 1] of rays that hit nothing.
         samples: rays along each side of a pixel (2: four rays a pixel).
-        depth: also make depth images.
+        depth: also renders depth images.
     """
 
     def __init__(
@@ -110,16 +110,16 @@ class Renderer:
     ):
         self.rig, self.surfaces, self.samples, self.wants_depth = rig, tuple(surfaces), samples, depth
         counts = [len(surface.faces) for surface in self.surfaces]
-        self.owner = np.repeat(np.arange(len(counts)), counts)  # surface of every face of the joint mesh
+        self.owner = np.repeat(np.arange(len(counts)), counts)  # surface of every face of the joined mesh
         self.first_face = np.cumsum([0, *counts])
         self.origins, directions = pixel_rays(rig, samples)
         self.directions = directions.astype(np.float32)
         self._draw_ground(directions, ground, np.asarray(background, dtype=np.float64))
 
     def _draw_ground(self, directions, ground, background):
-        """The scene without bodies: colour in light and in shadow, and distance, of every ray."""
+        """Renders the scene without bodies: colour with and without shadow, and distance, of every ray."""
         if ground is None:
-            ground = Ground(-1.0, 0.0)  # no point lies on it
+            ground = Ground(-1.0, 0.0)  # without points
         height = (self.origins[:, 2] - ground.height).reshape(-1, 1, 1, 1)
         down = directions[..., 2]
         distance = np.where((down < 0) & (height > 0), -height / np.where(down < 0, down, -1), np.inf)
@@ -141,7 +141,7 @@ class Renderer:
         self.base_instance = np.where(hit, GROUND, BACKGROUND).astype(np.uint8).reshape(-1)
 
     def draw(self, vertices: Sequence[np.ndarray]) -> View:
-        """Images of the bodies with these vertices, [V, 3] each, metres, world."""
+        """Renders the bodies with these vertices, [V, 3] each, world coordinates in metres."""
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 
@@ -166,7 +166,7 @@ class Renderer:
         return self._collect(color, instance, distance)
 
     def _rays_near(self, vertices) -> np.ndarray:
-        """Indices of the rays inside the bounding rectangle of any body in each image."""
+        """Indices of the rays inside the bounding rectangle of a body in each image."""
         rig, per_pixel = self.rig, self.samples**2
         near = np.zeros((rig.n_cams, rig.size, rig.size), dtype=bool)
         for points in vertices:
@@ -181,7 +181,7 @@ class Renderer:
         return (np.flatnonzero(near)[:, None] * per_pixel + np.arange(per_pixel)).reshape(-1)
 
     def _cast_shadow(self, tree, vertices, color):
-        # Only ground points whose way to the light passes a body's bounding sphere can lie in shadow.
+        # Only ground points whose shadow ray passes through a body's bounding sphere can be in shadow.
         near = np.zeros(len(self.ground_points), dtype=bool)
         for points in vertices:
             centre = (points.min(0) + points.max(0)) / 2
@@ -222,7 +222,7 @@ class Renderer:
         return albedo
 
     def _collect(self, color, instance, distance) -> View:
-        """Means of the rays of each pixel; it shows what most of them hit, a body or the ground on a draw."""
+        """Averages the rays of each pixel. Its instance is that of most rays; ties favour bodies, then the ground."""
         shape = (self.rig.n_cams, self.rig.size, self.rig.size, self.samples**2)
         rgb = np.zeros((*shape[:3], 3), dtype=np.float32)
         per_ray = color.reshape(*shape, 3)

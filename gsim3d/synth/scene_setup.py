@@ -1,5 +1,4 @@
-"""The input of an engine: bodies, a cloth and a ground at time 0, in metres, seconds and kilograms; and checks of what
-it returns."""
+"""Input of an engine (bodies, cloth and ground at time 0, in SI units), and checks of its output."""
 
 from __future__ import annotations
 
@@ -8,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 GRAVITY = 9.81  # m/s^2, along -z
-MAX_STRETCH = 2.0  # a body's bounding box longer or shorter than so many times at rest: the simulation has failed
-MAX_SINK = 0.1  # of the body height below the ground: the same
-MAX_THROUGH = 0.03  # metres of a body below the cloth over it, or of the cloth below the ground: the same
-STORED = 0.5  # seconds that a body stays squeezed at most
-MAX_GAIN = 0.3  # J/kg that bodies may gain: what a fall of 3 cm gives; centres are known to about a third of it
+# Limits beyond which a simulation has failed.
+MAX_STRETCH = 2.0  # factor on the diagonal of a body's bounding box
+MAX_SINK = 0.1  # depth below the ground over the body's height
+MAX_THROUGH = 0.03  # depth of a body below the cloth, or of the cloth below the ground, in metres
+STORED = 0.5  # longest time in seconds that a body stores elastic energy
+MAX_GAIN = 0.3  # gain of energy in J/kg, as of a fall of 3 cm; the error of centers is about a third of it
 
 
 @dataclass(frozen=True)
@@ -20,9 +20,9 @@ class Material:
     """Material of a soft body.
 
     Attributes:
-        young: Young's modulus, Pa.
-        damping: seconds.
-        yield_strain: from which on deformation lasts; 0: never.
+        young: Young's modulus in Pa.
+        damping: damping time in seconds.
+        yield_strain: strain at which plastic deformation begins; 0: purely elastic.
     """
 
     young: float
@@ -35,13 +35,13 @@ class SoftBody:
     """A soft body.
 
     Attributes:
-        vertices: [V, 3] of its collision mesh, in the world.
-        faces: [F, 3] of its collision mesh.
-        velocity: [3] m/s.
-        spin: [3] rad/s about the centre.
-        material: of the whole body.
-        mass: kg.
-        cells: of the control grid along each axis.
+        vertices: collision mesh [V, 3], world coordinates in metres.
+        faces: collision mesh [F, 3].
+        velocity: [3] in m/s.
+        spin: [3] in rad/s about the center.
+        material: material of the body.
+        mass: mass in kg.
+        cells: cells of the control grid along each axis.
     """
 
     vertices: np.ndarray
@@ -58,12 +58,12 @@ class RigidBody:
     """A rigid body.
 
     Attributes:
-        parts: vertices [V, 3] of the convex pieces that make up the body, in the world.
-        velocity: [3] m/s.
-        spin: [3] rad/s about the centre.
-        mass: kg.
-        friction: sliding.
-        bounce: 0 to 1, part of the speed that an impact leaves, roughly.
+        parts: vertices [V, 3] of the convex pieces of the body, world coordinates in metres.
+        velocity: [3] in m/s.
+        spin: [3] in rad/s about the center.
+        mass: mass in kg.
+        friction: coefficient of sliding friction.
+        bounce: approximate coefficient of restitution in [0, 1].
     """
 
     parts: tuple[np.ndarray, ...]
@@ -76,16 +76,16 @@ class RigidBody:
 
 @dataclass(frozen=True)
 class Cloth:
-    """A square cloth that hangs from its four corners.
+    """A square cloth with four fixed corners.
 
     Attributes:
-        width: metres.
-        height: metres, of the corners.
+        width: width in metres.
+        height: height of the corners in metres.
         count: nodes along a side.
-        mass: kg.
-        young: Young's modulus, Pa.
-        thickness: metres, for stiffness.
-        damping: seconds.
+        mass: mass in kg.
+        young: Young's modulus in Pa.
+        thickness: thickness in metres, for the stiffness.
+        damping: damping time in seconds.
     """
 
     width: float
@@ -97,18 +97,18 @@ class Cloth:
     damping: float
 
     def rest_nodes(self) -> np.ndarray:
-        """[n, n, 3] metres, world, at time 0."""
+        """Nodes at time 0 [n, n, 3], world coordinates in metres."""
         part = self.width * (np.arange(self.count) / (self.count - 1) - 0.5)
         return np.stack(np.meshgrid(part, part, [self.height], indexing="ij"), -1)[:, :, 0]
 
 
 @dataclass(frozen=True)
 class Pusher:
-    """A sphere that moves as commanded and that nothing else moves.
+    """A kinematic sphere.
 
     Attributes:
-        position: [3] metres, its centre at time 0.
-        radius: metres.
+        position: center at time 0 [3] in metres.
+        radius: radius in metres.
     """
 
     position: np.ndarray
@@ -120,10 +120,10 @@ class SceneSetup:
     """A scene at time 0.
 
     Attributes:
-        bodies: soft or rigid.
-        ground: height, metres; None: no ground.
-        cloth: or None.
-        pusher: or None.
+        bodies: soft or rigid bodies.
+        ground: height of the ground in metres; None: no ground.
+        cloth: cloth; None: no cloth.
+        pusher: kinematic sphere; None: no sphere.
     """
 
     bodies: tuple[SoftBody | RigidBody, ...]
@@ -133,11 +133,11 @@ class SceneSetup:
 
 
 class Unstable(Exception):
-    """A trajectory is no motion of bodies: one exploded, or went through ground or cloth."""
+    """The simulation has failed: a body exploded, or passed through ground or cloth."""
 
 
 def check_motion(vertices: np.ndarray, ground: float | None) -> None:
-    """Raises Unstable unless ``vertices`` [T, V, 3] keep their size and stay above the ground, as a body does."""
+    """Raises Unstable if a body ``vertices`` [T, V, 3] changes its size too much or sinks into the ground."""
     if not np.isfinite(vertices).all():
         raise Unstable("positions are not finite")
     size = np.linalg.norm(np.ptp(vertices, axis=1), axis=-1)
@@ -148,15 +148,15 @@ def check_motion(vertices: np.ndarray, ground: float | None) -> None:
 
 
 def check_energy(centres: np.ndarray, masses: np.ndarray, spin: float, fps: float) -> None:
-    """Raises Unstable where bodies gain energy.
+    """Raises Unstable if bodies gain energy.
 
-    A squeezed body gives back its elastic energy within STORED seconds: over longer times the energy of the centres may
-    only fall.
+    A compressed body releases its elastic energy within STORED seconds, so the energy of the centers must not grow over
+    longer times.
 
     Args:
-        centres: [B, T, 3] of the bodies; deformation and turning are not counted.
-        masses: [B] kg.
-        spin: J/kg of turning at the start.
+        centres: centers of the bodies [B, T, 3] in metres.
+        masses: masses [B] in kg.
+        spin: initial rotational energy in J/kg.
         fps: frames a second.
     """
     if centres.shape[1] < 2:
@@ -171,7 +171,7 @@ def check_energy(centres: np.ndarray, masses: np.ndarray, spin: float, fps: floa
 
 
 def check_cloth(bodies: list[np.ndarray], cloth: np.ndarray, ground: float | None) -> None:
-    """Raises Unstable unless ``bodies`` [T, V, 3] stay above ``cloth`` [T, n, n, 3], and the cloth above the ground."""
+    """Raises Unstable if ``bodies`` [T, V, 3] pass through ``cloth`` [T, n, n, 3], or the cloth through the ground."""
     if not np.isfinite(cloth).all():
         raise Unstable("positions of the cloth are not finite")
     if ground is not None and cloth[..., 2].min() < ground - MAX_THROUGH:
@@ -182,11 +182,11 @@ def check_cloth(bodies: list[np.ndarray], cloth: np.ndarray, ground: float | Non
 
 
 def depth_below_cloth(points: np.ndarray, cloth: np.ndarray) -> float:
-    """Metres by which the deepest point lies below the cloth; negative: all lie above.
+    """Depth of the deepest point below the cloth in metres; negative if all points are above it.
 
     Args:
         points: [N, 3].
-        cloth: [n, n, 3], a grid so fine that the nearest node, seen from above, has the height of the cloth.
+        cloth: grid [n, n, 3]; the height below a point is that of the nearest node.
     """
     nodes = cloth.reshape(-1, 3)
     low, high = nodes[:, :2].min(0), nodes[:, :2].max(0)

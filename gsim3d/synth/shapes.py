@@ -1,6 +1,6 @@
-"""Bodies: closed procedural meshes with solid patterns, and textured meshes from files.
+"""Procedural bodies: closed meshes with solid patterns.
 
-A body is centred on its bounding box and scaled to fit a sphere of diameter 1; a scene gives it its size.
+The bounding box of a body is centred at the origin, and the body fits a sphere of diameter 1.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ import numpy as np
 
 from gsim3d.errors import InputError
 
-FINE_LEVEL = 4  # icosphere subdivisions of the drawn mesh: 2562 vertices, smooth outlines at 256 pixels
-COARSE_LEVEL = 2  # of the mesh that collides: 162 vertices, each a possible contact
-TORUS_RINGS = {FINE_LEVEL: (64, 32), COARSE_LEVEL: (20, 9)}  # corners around the hole and around the tube
-KNOT_RINGS = {FINE_LEVEL: (160, 20), COARSE_LEVEL: (42, 6)}  # along the tube and around it
+FINE_LEVEL = 4  # icosphere subdivisions of the rendered mesh: 2562 vertices, smooth outlines at 256 pixels
+COARSE_LEVEL = 2  # icosphere subdivisions of the collision mesh: 162 vertices
+TORUS_RINGS = {FINE_LEVEL: (64, 32), COARSE_LEVEL: (20, 9)}  # vertices around the hole and around the tube
+KNOT_RINGS = {FINE_LEVEL: (160, 20), COARSE_LEVEL: (42, 6)}  # vertices along the tube and around it
 TURNED_SIDES = {FINE_LEVEL: 64, COARSE_LEVEL: 24}
 
 PALETTE = np.array(
@@ -28,16 +28,16 @@ PALETTE = np.array(
 
 @dataclass(frozen=True)
 class Body:
-    """A mesh to draw, a light mesh to collide, and the colour of every surface point.
+    """A rendered mesh, a collision mesh, and the colour of every surface point.
 
     Attributes:
-        name: of the shape or file.
-        vertices: [V, 3] of the drawn mesh.
-        faces: int [F, 3] of the drawn mesh.
-        collision_vertices: [V', 3] of the simulated mesh.
-        collision_faces: int [F', 3] of the simulated mesh.
-        corners: [F, 3, C], input of ``paint`` at the corners of a face: texture or rest coordinates.
-        paint: [N, C] -> colours [N, 3] in [0, 1].
+        name: name of the shape or file.
+        vertices: rendered mesh [V, 3].
+        faces: rendered mesh, int [F, 3].
+        collision_vertices: collision mesh [V', 3].
+        collision_faces: collision mesh, int [F', 3].
+        corners: input of ``paint`` at the corners of each face [F, 3, C]: texture or rest coordinates.
+        paint: function [N, C] -> colours [N, 3] in [0, 1].
     """
 
     name: str
@@ -50,7 +50,7 @@ class Body:
 
 
 def icosphere(level: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit sphere of 20 * 4^level triangles, all facing outwards."""
+    """Unit sphere of 20 * 4^level triangles that face outwards."""
     import trimesh
 
     mesh = trimesh.creation.icosphere(subdivisions=level)
@@ -58,7 +58,7 @@ def icosphere(level: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _radial(radius: Callable[[np.ndarray], np.ndarray]):
-    """A surface seen whole from its centre: ``radius`` of every direction."""
+    """A star-shaped surface: ``radius`` of every direction."""
 
     def build(level):
         directions, faces = icosphere(level)
@@ -85,7 +85,7 @@ def _blob(d):
 
 
 def _star(d):
-    # Bumps towards the corners of a dodecahedron's inscribed cube and its faces: fourteen soft arms.
+    # Fourteen soft arms towards the corners and faces of a cube.
     arms = [(i, j, k) for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]
     arms += [(s, 0, 0) for s in (-1, 1)] + [(0, s, 0) for s in (-1, 1)] + [(0, 0, s) for s in (-1, 1)]
     arms = np.array(arms, dtype=np.float64)
@@ -96,7 +96,7 @@ def _star(d):
 
 def _capsule(level):
     directions, faces = icosphere(level)
-    # The equator of the sphere is pulled apart into a cylinder: points move along x by a smooth step.
+    # Stretches a sphere at its equator: a smooth step along x.
     shift = 0.45 * np.tanh(4 * directions[:, :1])
     return directions * 0.62 + shift * np.array([[1.0, 0, 0]]), faces
 
@@ -116,7 +116,7 @@ def _cross(d):
 
 
 def _pyramid(d):
-    # A tetrahedron with rounded edges: the nearest of four planes, softened.
+    # A tetrahedron with rounded edges: soft minimum over four planes.
     planes = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3)
     return (np.maximum((d[:, None] * planes).sum(-1), 0) ** 7).sum(1) ** (-1 / 7)
 
@@ -144,7 +144,7 @@ def _knot(level):
 
 
 def _turned(corners: list[tuple[float, float]]):
-    """A surface of revolution about z with sharp edges: (radius, height) of its profile from top to bottom."""
+    """A surface of revolution about z with sharp edges; ``corners`` are (radius, height) from top to bottom."""
 
     def build(level):
         n = TURNED_SIDES[level]
@@ -162,7 +162,7 @@ def _turned(corners: list[tuple[float, float]]):
         a = (len(rings) - 1) * n
         faces.append(np.stack([a + j, a + i, np.full(n, last)], 1))
         faces = np.concatenate(faces)
-        if level == FINE_LEVEL:  # a vertex for each corner of a face, so that edges are drawn sharp
+        if level == FINE_LEVEL:  # separate vertices for each face give sharp edges
             return vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3)
         return vertices, faces
 
@@ -219,13 +219,13 @@ PATTERNS = {"checker": _checker, "dots": _dots, "patches": _patches, "stripes": 
 
 
 def normalise(vertices: np.ndarray) -> tuple[np.ndarray, float]:
-    """Centre [3] of the bounding box of ``vertices``, and the diameter of the sphere around it that holds them."""
+    """Center [3] of the bounding box of ``vertices``, and diameter of the enclosing sphere around it."""
     centre = (vertices.min(0) + vertices.max(0)) / 2
     return centre, 2 * float(np.linalg.norm(vertices - centre, axis=1).max())
 
 
 def procedural_body(name: str, rng: np.random.Generator) -> Body:
-    """One of SHAPES, painted with a random solid pattern of three colours."""
+    """A body of SHAPES with a random solid pattern of three colours."""
     if name not in SHAPES:
         raise InputError(f"object {name!r} is not known; choose from {', '.join(SHAPES)}")
     vertices, faces = SHAPES[name](FINE_LEVEL)
@@ -236,7 +236,7 @@ def procedural_body(name: str, rng: np.random.Generator) -> Body:
 
 
 def random_paint(rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
-    """Colours [N, 3] of points [N, 3] of a unit body: a random pattern of three random colours."""
+    """Random pattern of three colours, as a function from points [N, 3] of a unit body to colours [N, 3]."""
     pattern = PATTERNS[sorted(PATTERNS)[rng.integers(len(PATTERNS))]]
     colors = PALETTE[rng.permutation(len(PALETTE))[:3]]
     return lambda points: pattern(points, colors)

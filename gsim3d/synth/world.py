@@ -1,4 +1,4 @@
-"""What all worlds share: their options, and how one scene is drawn, simulated, checked and rendered."""
+"""Base class of worlds: options, and the random draw, simulation, checks and rendering of a scene."""
 
 from __future__ import annotations
 
@@ -22,33 +22,33 @@ from gsim3d.synth.bodies import OBJECTS, load_mesh, mesh_bytes, mesh_name, name_
 from gsim3d.synth.embedding import Embedding, grid_faces
 from gsim3d.synth.scene_setup import GRAVITY, Cloth, RigidBody, SceneSetup, SoftBody, Unstable
 
-MAX_ATTEMPTS = 40  # draws of one scene before the options are called impossible
+MAX_ATTEMPTS = 40  # draws of a scene before it fails
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 MESH_UPS = ("y", "z")
 ENGINES = {"mujoco": "gsim3d.synth.mujoco_engine", "genesis": "gsim3d.synth.genesis_engine"}
-CLOTH_REFINEMENT = 3  # drawn cloth is so many times finer than the simulated one
-GAP = 0.03  # metres between the spheres around two bodies at the start
+CLOTH_REFINEMENT = 3  # resolution of the rendered cloth over the simulated one
+GAP = 0.03  # smallest initial distance between the bounding spheres of two bodies in metres
 TRAIN = "train"
-CLOTH_COLOR = (0.78, 0.14, 0.12)  # where looks are functions of the name
-LATER_OPTIONS = ("by_name", "ground_albedo")  # at their defaults, sets that are older than them go on
-MAX_SPREAD = 0.25  # of cameras: bodies leave the views of closer ones
-HIGHER, STEEPER = 0.5, 45.0  # times the spread: the target in distances, the rings in degrees
-RIM_POINTS = 64  # of the ground, where its depths are checked
+CLOTH_COLOR = (0.78, 0.14, 0.12)  # of worlds with ``by_name``
+LATER_OPTIONS = ("by_name", "ground_albedo")  # not in fingerprints at their defaults, so that older sets stay valid
+MAX_SPREAD = 0.25  # largest camera_spread; bodies would leave the view of closer cameras
+HIGHER, STEEPER = 0.5, 45.0  # spread of the target height (in distances) and of the elevation (in degrees)
+RIM_POINTS = 64  # points of the ground's rim whose depths are checked
 
 
 class Rejected(Exception):
-    """A drawn trajectory that leaves the view, the ground or the depth range."""
+    """A trajectory leaves the view, the ground or the depth range."""
 
 
 @dataclass(frozen=True)
 class Actor:
-    """One drawn body.
+    """A body of a scene.
 
     Attributes:
-        body: what is simulated.
-        surface: what is rendered.
-        vertices: [V, 3] metres, of the surface at time 0.
-        facts: what metadata.json says of it.
+        body: simulated body.
+        surface: rendered surface.
+        vertices: vertices of the surface at time 0 [V, 3] in metres.
+        facts: entry of metadata.json.
     """
 
     body: SoftBody | RigidBody
@@ -59,13 +59,13 @@ class Actor:
 
 @dataclass(frozen=True)
 class SceneDraw:
-    """One draw of a trajectory.
+    """A random draw of a scene at time 0.
 
     Attributes:
-        ground: height, metres; None: no ground.
-        cloth: or None.
+        ground: height of the ground in metres; None: no ground.
+        cloth: cloth; None: no cloth.
         actors: bodies.
-        surfaces: of the actors, and of the cloth last.
+        surfaces: surfaces of the bodies, and of the cloth last.
     """
 
     ground: float | None
@@ -76,50 +76,48 @@ class SceneDraw:
 
 @dataclass(frozen=True)
 class World(ABC):
-    """Options of a data set. Lengths in metres, times in seconds; pairs are ranges that every trajectory draws from."""
+    """Options of a data set. Lengths are in metres, times in seconds; pairs are ranges of uniform random draws."""
 
-    n_trajectories: int = 34  #: the usual split keeps 30 for training and 4 for tests
+    n_trajectories: int = 34  #: number of trajectories; the default split is 30 for training and 4 for tests
     n_frames: int = 24  #: steps of a trajectory
     fps: float = 24.0  #: steps per second
     image_size: int = 64  #: pixels, width and height
     n_cams: int = 12  #: cameras, on two rings
-    seed: int = 0  #: another seed gives other trajectories
-    subset: str = TRAIN  #: which set of scenes; a held-out one draws other random numbers
-    engine: str = "mujoco"  #: simulator of bodies, a key of ENGINES
-    objects: tuple[str, ...] = shapes.SOFT_SHAPES  #: shapes, dealt to the trajectories in turn
-    meshes: tuple[str, ...] = ()  #: files; they take part like objects, and alone where objects is empty
+    seed: int = 0  #: random seed
+    subset: str = TRAIN  #: "train" or a held-out set, which has random numbers of its own
+    engine: str = "mujoco"  #: physics engine, a key of ENGINES
+    objects: tuple[str, ...] = shapes.SOFT_SHAPES  #: shapes, assigned to trajectories in turn
+    meshes: tuple[str, ...] = ()  #: mesh files, additional objects
     mesh_up: str = "y"  #: axis of mesh files that points up
-    by_name: bool = False  #: paint, friction and bounce are functions of the body's name, not drawn; the cloth is red
+    by_name: bool = False  #: paint, friction and bounce depend on the body's name only; the cloth is red
     background: str = "black"  #: colour behind the ground
-    depth: bool = False  #: whether depth images are written
+    depth: bool = False  #: writes depth images
     samples: int = 2  #: rays along each side of a pixel
-    n_bodies: tuple[int, int] = (1, 1)  #: the first is the scene's object, others are any
-    body_size: tuple[float, float] = (0.6, 0.76)  #: diameter of the sphere that holds the body
-    drop_height: tuple[float, float] = (0.5, 0.7)  #: of the lowest point above what it falls on
-    speed: float = 0.35  #: largest horizontal speed at the start, m/s
-    lift: tuple[float, float] = (0.0, 0.0)  #: upward speed at the start, m/s
-    spin: float = 1.2  #: largest, rad/s
-    spread: float = 0.08  #: largest distance from the middle, along x and y, of the position aimed at
-    max_timestep: float = 1 / 480  #: seconds, of the engine
-    distance: float = 2.6  #: of the cameras from the point they look at
-    elevations: tuple[float, float] = (18.0, 42.0)  #: degrees, of the low and the high ring
-    target_height: float = 0.52  #: of the point that cameras look at
-    fov: float = 42.0  #: degrees
-    camera_spread: float = 0.0  #: how much cameras differ from scene to scene, see rig(); 0: not at all
+    n_bodies: tuple[int, int] = (1, 1)  #: number of bodies; all but the first are random objects
+    body_size: tuple[float, float] = (0.6, 0.76)  #: diameter of the enclosing sphere of a body
+    drop_height: tuple[float, float] = (0.5, 0.7)  #: height of the lowest point above ground or cloth
+    speed: float = 0.35  #: largest initial horizontal speed in m/s
+    lift: tuple[float, float] = (0.0, 0.0)  #: initial upward speed in m/s
+    spin: float = 1.2  #: largest initial spin in rad/s
+    spread: float = 0.08  #: largest offset of the target position from the center along x and y
+    max_timestep: float = 1 / 480  #: largest time step of the engine
+    distance: float = 2.6  #: distance of the cameras from their target
+    elevations: tuple[float, float] = (18.0, 42.0)  #: elevation of the low and the high ring in degrees
+    target_height: float = 0.52  #: height of the cameras' target
+    fov: float = 42.0  #: vertical field of view in degrees
+    camera_spread: float = 0.0  #: variation of the cameras between scenes, see rig(); 0: none
     ground: bool = True  #: whether there is a ground
-    ground_height: tuple[float, float] = (0.0, 0.0)  #: of the ground
-    ground_radius: float = 0.85  #: of the round ground
-    ground_albedo: float | None = None  #: grey of the whole ground; None: rings cut into sectors of three colours
-    near: float = 1.5  #: smallest depth that images show
-    far: float = 3.8  #: largest depth that images show
+    ground_height: tuple[float, float] = (0.0, 0.0)  #: height of the ground
+    ground_radius: float = 0.85  #: radius of the ground
+    ground_albedo: float | None = None  #: uniform grey of the ground; None: a pattern of three colours
+    near: float = 1.5  #: smallest visible depth
+    far: float = 3.8  #: largest visible depth
 
     name = ""
     engines = tuple(ENGINES)
 
-    # ---- options ----
-
     def check(self) -> None:
-        """Raises InputError for options that cannot make a scene."""
+        """Raises InputError for invalid options."""
         self._check_counts(n_trajectories=1, n_frames=1, image_size=1, n_cams=1, samples=1)
         for field in ("fps", "max_timestep", "distance", "fov", "ground_radius", "near"):
             if not 0 < getattr(self, field) < np.inf:
@@ -129,9 +127,9 @@ class World(ABC):
             if not 0 < low <= high < np.inf:
                 raise InputError(f"{field} must be two positive numbers, the smaller first; got {low} {high}")
         if not self.near < self.far < np.inf:
-            raise InputError(f"far must lie beyond near; got near {self.near} and far {self.far}")
+            raise InputError(f"far must be above near; got near {self.near} and far {self.far}")
         if self.depth and self.far > writer.MAX_DEPTH:
-            raise InputError(f"depth images reach to {writer.MAX_DEPTH} m; got far {self.far}")
+            raise InputError(f"far must be at most {writer.MAX_DEPTH} m with depth images; got {self.far}")
         if not 0 <= self.camera_spread <= MAX_SPREAD:
             raise InputError(f"camera_spread must be from 0 to {MAX_SPREAD:g}; got {self.camera_spread!r}")
         if self.ground_albedo is not None and not 0 <= self.ground_albedo <= 1:
@@ -148,7 +146,7 @@ class World(ABC):
         names = self.object_names()
         repeated = [name for name, count in Counter(names).items() if count > 1]
         if repeated or not names:
-            raise InputError(f"objects and mesh files need names of their own; repeated: {repeated}, all: {names}")
+            raise InputError(f"objects and mesh files must have different names; repeated: {repeated}, all: {names}")
         for path in self.meshes:
             load_mesh(path, self.mesh_up)
         if self.ground:
@@ -171,23 +169,23 @@ class World(ABC):
             seen = depth[(depth > 0) & (pixels >= 0).all(-1) & (pixels <= rig.size).all(-1)]
             if len(seen) and not (rig.near <= seen.min() and seen.max() <= rig.far):
                 raise InputError(
-                    f"the ground is seen from {seen.min():.2f} to {seen.max():.2f} m, beyond near {rig.near} and far "
-                    f"{rig.far}"
+                    f"visible depths of the ground, {seen.min():.2f} to {seen.max():.2f} m, exceed near {rig.near} and "
+                    f"far {rig.far}"
                 )
 
     def object_names(self) -> list[str]:
-        """Names of objects and mesh files, in the order in which trajectories are dealt to them."""
+        """Names of objects and mesh files, in the order of their assignment to trajectories."""
         return [*self.objects, *map(mesh_name, self.meshes)]
 
     def scenes(self) -> list[tuple[str, int]]:
-        """(object, sample) of every trajectory: one of each object in turn."""
+        """(object, sample) of every trajectory, with objects in turn."""
         names = self.object_names()
         return [(names[i % len(names)], i // len(names)) for i in range(self.n_trajectories)]
 
     def fingerprint(self, name: str) -> str:
-        """Hash of all that the scenes of object ``name`` depend on, apart from their sample number."""
+        """Hash of all options that the scenes of object ``name`` depend on."""
         fields = dataclasses.asdict(self)
-        others = self.n_bodies[1] > 1  # then any object may appear in a scene of this one
+        others = self.n_bodies[1] > 1  # scenes then have random other objects
         unused = (
             ["n_trajectories", "meshes"] + ["objects"] * (not others) + ["camera_spread"] * (not self.camera_spread)
         )
@@ -201,11 +199,10 @@ class World(ABC):
         return digest.hexdigest()
 
     def rig(self, scene: tuple[str, int] | None = None) -> cameras.Rig:
-        """The cameras of a scene; None: those that all scenes differ from.
+        """Cameras of a scene; None: without variation.
 
-        With a ``camera_spread`` of s they stand up to s times their distance nearer or farther, look at a point up to
-        s / 2 distances higher or lower, from up to 45 s degrees less or more above the horizon, and both rings are
-        turned by any angle.
+        A ``camera_spread`` of s varies the distance by a factor of 1 +- s, the target height by +- s / 2 distances, the
+        elevations by +- 45 s degrees, and the azimuth of both rings uniformly.
         """
         if scene is None or not self.camera_spread:
             return self._rig()
@@ -213,7 +210,7 @@ class World(ABC):
         return self._rig(*rng.uniform(-1, 1, 3), turned=rng.uniform(0, 2 * np.pi))
 
     def _rig(self, farther: float = 0.0, higher: float = 0.0, steeper: float = 0.0, turned: float = 0.0) -> cameras.Rig:
-        """The cameras, each difference as a share of the largest."""
+        """Cameras with variations in [-1, 1], relative to the largest."""
         spread = self.camera_spread
         return cameras.two_rings(
             self.n_cams,
@@ -228,23 +225,21 @@ class World(ABC):
         )
 
     def effects(self) -> EffectsSpec:
-        """What its scenes call for: positions and velocities, matt surfaces, and shadows where there is a ground."""
+        """Effects of the scenes: matte surfaces, a history of two steps, and shadows if there is a ground."""
         return EffectsSpec(
             DynamicsEffects("frozen" if self.ground else "masked_out", history=2),
             AppearanceEffects(view_dependent=0, changing="all" if self.ground else "dynamic"),
             outputs=OutputEffects(depth=self.depth),
         )
 
-    # ---- one trajectory ----
-
     def make(self, name: str, sample: int) -> writer.Scene:
-        """Trajectory ``sample`` of object ``name``, simulated and rendered; draws again until one can be used."""
+        """Simulates and renders trajectory ``sample`` of object ``name``; redraws rejected trajectories."""
         rejected = []
         rig = self.rig((name, sample))
         for attempt in range(MAX_ATTEMPTS):
             drawn = self.draw(name, sample, attempt)
             try:
-                # Before the costly part.
+                # Cheap check before the simulation.
                 self._check_view(rig, drawn.ground, [actor.vertices[None] for actor in drawn.actors])
                 embeddings, moved = self.simulate(drawn)
                 self._check_trajectory(rig, drawn, moved)
@@ -268,12 +263,12 @@ class World(ABC):
                 fingerprint=self.fingerprint(name),
             )
         raise InputError(
-            f"{name}: none of {MAX_ATTEMPTS} draws could be used ({Counter(rejected).most_common(1)[0][0]}); "
+            f"{name}: all {MAX_ATTEMPTS} draws were rejected ({Counter(rejected).most_common(1)[0][0]}); "
             "lower the drop height or the body size, or widen the view"
         )
 
     def draw(self, name: str, sample: int, attempt: int) -> SceneDraw:
-        """Trajectory ``sample`` of object ``name`` at time 0, at its ``attempt``-th draw."""
+        """Draws trajectory ``sample`` of object ``name`` at time 0; each ``attempt`` has other random numbers."""
         subset = [zlib.crc32(text.encode()) for text in (self.name, self.subset) if text not in ("elastic", TRAIN)]
         rng = np.random.default_rng([self.seed, zlib.crc32(name.encode()), sample, attempt, *subset])
         ground, cloth, actors = self._draw(name, rng)
@@ -283,7 +278,7 @@ class World(ABC):
         return SceneDraw(ground, cloth, actors, surfaces)
 
     def renderer(self, rig: cameras.Rig, drawn: SceneDraw) -> render.Renderer:
-        """A renderer of ``drawn``, seen by the cameras of ``rig``."""
+        """Renderer of a draw with the cameras ``rig``."""
         ground = None if drawn.ground is None else render.Ground(self.ground_radius, drawn.ground, self.ground_albedo)
         background = BACKGROUNDS[self.background]
         return render.Renderer(
@@ -291,13 +286,13 @@ class World(ABC):
         )
 
     def simulate(self, drawn: SceneDraw) -> tuple[list[Embedding], list[np.ndarray]]:
-        """The motion of a draw, not checked.
+        """Simulates a draw, without checks.
 
         Returns:
-            The embedding of each body, and of the cloth last; and the vertices [T, V, 3] of every surface.
+            Embeddings of the bodies and of the cloth last, and the vertices [T, V, 3] of every surface.
 
         Raises:
-            Unstable: the solver gives up.
+            Unstable: the solver diverges.
         """
         engine = importlib.import_module(ENGINES[self.engine])
         setup = SceneSetup(tuple(actor.body for actor in drawn.actors), drawn.ground, drawn.cloth)
@@ -329,7 +324,7 @@ class World(ABC):
             body = named_body(name, name_rng(name) if self.by_name else rng)
         else:
             body = load_mesh(path, self.mesh_up)
-        # Mesh files keep their feet down and turn about the vertical; bodies of the package have no top.
+        # Mesh files stay upright and rotate about the z axis; other bodies have a random orientation.
         rotation = _random_rotation(rng) if path is None else _turn(rng.uniform(0, 2 * np.pi))
         size = rng.uniform(*self.body_size)
         vertices = size * (body.vertices[:, None, :] * rotation).sum(-1)
@@ -341,7 +336,7 @@ class World(ABC):
             velocity[2] = rng.uniform(*self.lift)
         aim = rng.uniform(-self.spread, self.spread, 2)
         position = np.array([*aim, floor + drop - vertices[:, 2].min()])
-        # A body that will drift starts upwind, so that it lands, or is halfway, near the middle.
+        # Compensates the horizontal drift, so that the body lands, or is halfway, near its target.
         position[:2] -= velocity[:2] * self._flight(drop, velocity[2])
         position = _clear_of(position, size / 2, before)
         axis = rng.normal(size=3)
@@ -352,7 +347,7 @@ class World(ABC):
         return Actor(simulated, surface, vertices + position, facts)
 
     def _flight(self, drop: float, lift: float) -> float:
-        """Seconds after which a body should pass over the position that it is aimed at."""
+        """Seconds until a body reaches its target position."""
         if not self.ground:
             return self.n_frames / self.fps / 2
         return (lift + np.sqrt(lift**2 + 2 * GRAVITY * drop)) / GRAVITY
@@ -365,27 +360,23 @@ class World(ABC):
         paint = _plain_cloth if self.by_name else shapes.random_paint(rng)
         return render.Surface(faces, points[faces], paint, two_sided=True)
 
-    # ---- what worlds differ in ----
-
     @abstractmethod
     def _make_body(self, name, vertices, faces, velocity, spin, rng) -> tuple[SoftBody | RigidBody, dict]:
-        """The body with its collision mesh at time 0, and more facts of it for metadata.json."""
+        """Returns the simulated body at time 0 and its facts for metadata.json."""
 
     def _drop(self, height: float, body_height: float) -> float:
-        """Height of the lowest point above what the body falls on, from the drawn one."""
+        """Drop height from the drawn ``height``."""
         return height
 
     def _painted(self, paint: Callable[[np.ndarray], np.ndarray], facts: dict) -> Callable[[np.ndarray], np.ndarray]:
-        """The paint of a body with these facts, from the one that was drawn."""
+        """Paint of a body with these facts, from the drawn ``paint``."""
         return paint
 
     def _draw_cloth(self, rng: np.random.Generator) -> Cloth | None:
         return None
 
-    # ---- what cannot be used ----
-
     def _check_trajectory(self, rig: cameras.Rig, drawn: SceneDraw, moved: list[np.ndarray]) -> None:
-        """Raises Unstable or Rejected; ``moved`` has the vertices [T, V, 3] of every surface."""
+        """Raises Unstable or Rejected for the vertices ``moved`` [T, V, 3] of all surfaces."""
         bodies = moved[: len(drawn.actors)]
         for vertices in bodies:
             scene_setup.check_motion(vertices, drawn.ground)
@@ -410,7 +401,7 @@ class World(ABC):
 
 
 def _clear_of(position: np.ndarray, radius: float, before: list[Actor]) -> np.ndarray:
-    """``position`` raised until a sphere around the body touches no other body's."""
+    """Raises ``position`` until the bounding sphere of the body touches no other."""
     position = position.copy()
     for actor in sorted(before, key=lambda actor: actor.vertices[:, 2].mean()):
         centre = (actor.vertices.min(0) + actor.vertices.max(0)) / 2
@@ -431,7 +422,7 @@ def _turn(angle: float) -> np.ndarray:
 
 
 def _random_rotation(rng: np.random.Generator) -> np.ndarray:
-    """Uniform rotation matrix, from a random unit quaternion."""
+    """Uniformly distributed rotation matrix, from a random unit quaternion."""
     w, x, y, z = (q := rng.normal(size=4)) / np.linalg.norm(q)
     return np.array(
         [

@@ -1,4 +1,4 @@
-"""The worlds: what differs between them; their presets and held-out sets are in assets/presets.yaml."""
+"""The worlds elastic, rigid and cloth; presets and held-out sets are in assets/presets.yaml."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from gsim3d.synth import bodies, meshes, shapes
 from gsim3d.synth.scene_setup import Cloth, Material, RigidBody, SoftBody
 from gsim3d.synth.world import TRAIN, World
 
-# Seeds of held-out trajectories: models are chosen on the first; the second is scored once a release.
+# Seeds of held-out sets: validation selects models; test is scored once a release.
 VALIDATION_SEED, TEST_SEED = 77, 78
-SOFT_DENSITY = 45.0  # kg/m^3 of the body's bounding box, about half of which it fills
-LIGHT_DENSITY = 20.0  # kg/m^3, of bodies that a cloth must carry
+SOFT_DENSITY = 45.0  # kg/m^3 of the bounding box, about half of which a body fills
+LIGHT_DENSITY = 20.0  # kg/m^3, for bodies on a cloth
 RIGID_DENSITY = 200.0  # kg/m^3
-SECONDS_WITHOUT_GROUND = 0.72  # then bodies have fallen out of reach
+SECONDS_WITHOUT_GROUND = 0.72  # then bodies leave the view
 
-# Ranges of Young's modulus [Pa] and yield strain; damping [s]. With them a body of the usual size is squeezed by 15 to
-# 40 % when it lands; rubber jumps back highest, foam hardly, clay keeps a dent.
+# Range of Young's modulus (Pa), damping (s), range of yield strain (None: elastic). A body is compressed by 15 to 40 %
+# at impact; rubber bounces highest, foam hardly, and clay deforms permanently.
 MATERIALS = {
     "jelly": ((5e3, 9e3), 0.01, None),
     "rubber": ((1.5e4, 2.5e4), 0.002, None),
@@ -30,7 +30,7 @@ MATERIALS = {
     "clay": ((8e3, 1.2e4), 0.04, (0.02, 0.05)),
     "putty": ((1e4, 1e4), 0.04, (0.03, 0.03)),
 }
-# Colours to which bodies lean where there are several materials: nothing else shows them before a body lands.
+# Tints of materials in worlds with several, which are not visible otherwise before the impact.
 TINTS = {
     "jelly": (0.15, 0.6, 0.25),
     "rubber": (0.1, 0.25, 0.8),
@@ -43,10 +43,10 @@ TINT_SHARE = 0.6
 
 @dataclass(frozen=True)
 class SoftWorld(World):
-    """Soft bodies of one or several materials."""
+    """Base class of worlds with soft bodies."""
 
-    materials: tuple[str, ...] = ("jelly",)  #: names in MATERIALS
-    cells: int = 3  #: of the control grid of a body, along each axis
+    materials: tuple[str, ...] = ("jelly",)  #: materials, keys of MATERIALS
+    cells: int = 3  #: cells of a body's control grid along each axis
 
     density = SOFT_DENSITY
 
@@ -75,28 +75,28 @@ class SoftWorld(World):
 
 @dataclass(frozen=True)
 class Elastic(SoftWorld):
-    """Soft bodies fall on a round ground, are squeezed and jump back or stay bent."""
+    """Soft bodies fall on a round ground and bounce or deform permanently."""
 
     name = "elastic"
 
     def _drop(self, height, body_height):
-        # A soft body that falls less than its own height is hardly squeezed; without ground there is no fall.
+        # A fall of less than the body's height hardly compresses it.
         return max(height, body_height) if self.ground else height
 
 
 @dataclass(frozen=True)
 class ClothWorld(SoftWorld):
-    """Soft bodies fall on a square cloth that hangs from its four corners over the ground."""
+    """Soft bodies fall on a square cloth with four fixed corners above the ground."""
 
     body_size: tuple[float, float] = (0.42, 0.56)
     drop_height: tuple[float, float] = (0.1, 0.35)
     speed: float = 0.2
     spread: float = 0.15
-    cloth_width: float = 1.7  #: metres
-    cloth_height: float = 0.8  #: metres, of the corners
+    cloth_width: float = 1.7  #: width
+    cloth_height: float = 0.8  #: height of the corners
     cloth_count: int = 17  #: nodes along a side
-    cloth_mass: tuple[float, float] = (0.6, 1.2)  #: kg
-    cloth_young: tuple[float, float] = (4e4, 1e5)  #: Pa
+    cloth_mass: tuple[float, float] = (0.6, 1.2)  #: mass in kg
+    cloth_young: tuple[float, float] = (4e4, 1e5)  #: Young's modulus in Pa
     max_timestep: float = 1 / 504
     distance: float = 3.2
     target_height: float = 0.62
@@ -117,7 +117,7 @@ class ClothWorld(SoftWorld):
 
 @dataclass(frozen=True)
 class Rigid(World):
-    """One to three rigid bodies are thrown on a round ground, hit each other, roll and come to rest."""
+    """One to three rigid bodies are thrown on a round ground, collide, roll and come to rest."""
 
     objects: tuple[str, ...] = shapes.RIGID_SHAPES
     n_bodies: tuple[int, int] = (1, 3)
@@ -129,8 +129,8 @@ class Rigid(World):
     lift: tuple[float, float] = (0.0, 0.8)
     spin: float = 5.0
     spread: float = 0.3
-    friction: tuple[float, float] = (0.4, 0.9)  #: sliding
-    bounce: tuple[float, float] = (0.1, 0.7)  #: part of the speed that an impact leaves, roughly
+    friction: tuple[float, float] = (0.4, 0.9)  #: coefficient of sliding friction
+    bounce: tuple[float, float] = (0.1, 0.7)  #: approximate coefficient of restitution
     max_timestep: float = 1 / 960
     distance: float = 3.4
     target_height: float = 0.55
@@ -161,25 +161,25 @@ def _with_tuples(value):
 WORLDS = {"elastic": Elastic, "rigid": Rigid, "cloth": ClothWorld}
 _FILE = _with_tuples(parse_yaml((Path(__file__).parent / "assets" / "presets.yaml").read_bytes()))
 PRESETS = _FILE["presets"]  # preset -> world -> options
-HELD_OUT = _FILE["held_out"]  # preset -> set -> world -> options that replace those of the preset
+HELD_OUT = _FILE["held_out"]  # preset -> set -> world -> options on top of the preset
 _RENAMED = {"paper": "diverse"}
 
 
 def build_world(world: str, preset: str, changes: dict) -> World:
-    """The checked settings of a world.
+    """Returns the validated settings of a world.
 
     Args:
         world: one of WORLDS.
         preset: one of PRESETS.
-        changes: replace single settings; "subset" names a held-out set.
+        changes: options that replace those of the preset; "subset" selects a held-out set.
 
     Raises:
-        InputError: an unknown name, or settings that cannot make a scene.
+        InputError: an unknown name or an invalid option.
     """
     if world not in WORLDS:
         raise InputError(f"world {world!r} is not known; choose from {', '.join(WORLDS)}{did_you_mean(world, WORLDS)}")
     if preset not in PRESETS:
-        hint = f"; {preset} is called {_RENAMED[preset]} now" if preset in _RENAMED else did_you_mean(preset, PRESETS)
+        hint = f"; {preset} is now called {_RENAMED[preset]}" if preset in _RENAMED else did_you_mean(preset, PRESETS)
         raise InputError(f"preset {preset!r} is not known; choose from {', '.join(PRESETS)}{hint}")
     known = {field.name for field in dataclasses.fields(WORLDS[world])}
     unknown = sorted(set(changes) - known)

@@ -1,8 +1,7 @@
 """Scene folders and the manifest of a generated data set.
 
-Layout: OUT/<object>/<sample>/metadata.json, cam_<j>/{rgb,seg,inst,depth}_<step>.png, states.npz; OUT/manifest.json,
-OUT/effects.yaml (what the scenes call for, see gsim3d.effects.spec).
-A scene is written to a hidden folder and renamed when it is whole.
+Layout: OUT/<object>/<sample>/metadata.json, cam_<j>/{rgb,seg,inst,depth}_<step>.png, states.npz; OUT/manifest.json;
+OUT/effects.yaml (see gsim3d.effects.spec). A scene is written to a hidden folder, which is renamed when complete.
 """
 
 from __future__ import annotations
@@ -26,27 +25,27 @@ from gsim3d.io.plain import parse_json
 from gsim3d.synth.cameras import Rig, workspace_origin
 from gsim3d.synth.render import View
 
-GENERATOR_VERSION = 3  # raise it whenever the same options would give other bytes
+GENERATOR_VERSION = 3  # increased whenever the bytes for given options change
 FILE_TEMPLATE = "cam_{cam_ix}/{img_type}_{n_step:04d}"
 PNG_COMPRESSION = 3
-DEPTH_UNIT = 1e-4  # metres a count of the 16-bit depth images
-MAX_DEPTH = 6.5  # metres that fit
+DEPTH_UNIT = 1e-4  # unit of the 16-bit depth images in metres
+MAX_DEPTH = 6.5  # largest depth in metres that fits
 PACKAGES = ("numpy", "mujoco-core", "embreex", "trimesh", "opencv-contrib-python-headless")
 
 
 @dataclass(frozen=True)
 class Scene:
-    """One rendered trajectory, ready to be written.
+    """A rendered trajectory.
 
     Attributes:
-        object: name of its first body.
-        sample: number among the trajectories of this object.
+        object: name of the first body.
+        sample: index of the trajectory of this object.
         fps: frames a second.
         rig: cameras.
         views: images of every frame.
-        states: float32 [T, ..., 3] metres by name: nodes of the embedding of each body, and of the cloth.
-        extras: more keys of metadata.json.
-        fingerprint: hash of the options that it depends on.
+        states: name of a body or "cloth" -> nodes of its embedding, float32 [T, ..., 3] in metres.
+        extras: additional keys of metadata.json.
+        fingerprint: hash of the options that the scene depends on.
     """
 
     object: str
@@ -60,22 +59,22 @@ class Scene:
 
 
 def scene_folder(out: Path, name: str, sample: int) -> Path:
-    """The folder of a trajectory in the data set ``out``."""
+    """Folder of a trajectory in the data set ``out``."""
     return out / name / f"{sample:04d}"
 
 
 def is_finished(folder: Path, fingerprint: str) -> bool:
-    """Whether ``folder`` holds a finished scene. Raises InputError where it was made with other options."""
+    """Whether ``folder`` holds a finished scene. Raises InputError if it was generated with other options."""
     metadata = folder / "metadata.json"
     if not metadata.is_file():
         return False
     if read_metadata(folder).get("fingerprint") != fingerprint:
-        raise InputError(f"{folder} was made with other options; choose another folder or remove it")
+        raise InputError(f"{folder} was generated with other options; choose another folder or remove it")
     return True
 
 
 def read_metadata(folder: Path) -> dict:
-    """The metadata.json of a scene. Raises InputError where it cannot be read."""
+    """Reads metadata.json of a scene. Raises InputError if it is invalid."""
     try:
         return parse_json((folder / "metadata.json").read_bytes())
     except (OSError, ValueError) as error:
@@ -83,7 +82,7 @@ def read_metadata(folder: Path) -> dict:
 
 
 def write_scene(out: Path, scene: Scene) -> Path:
-    """Writes ``scene`` below ``out``; the folder appears whole or not at all."""
+    """Writes ``scene`` to its folder in ``out``, atomically."""
     folder = scene_folder(out, scene.object, scene.sample)
     unfinished = folder.with_name(f".{folder.name}.unfinished")
     for leftover in (unfinished, folder):
@@ -109,7 +108,7 @@ def write_scene(out: Path, scene: Scene) -> Path:
 
 
 def _images(view: View) -> list[tuple[str, np.ndarray]]:
-    """Type and pixels [V, H, W, ...] of the images of one step, in the order in which they are hashed."""
+    """Type and pixels [V, H, W, ...] of the images of a step, in the order of hashing."""
     images = [("rgb", view.rgb[..., ::-1]), ("seg", view.segmentation), ("inst", view.instances)]
     if view.depth is not None:
         images.append(("depth", np.rint(view.depth / DEPTH_UNIT).astype(np.uint16)))
@@ -154,7 +153,7 @@ def _metadata(scene: Scene) -> dict:
 
 
 def write_manifest(out: Path, folders: list[Path], settings: dict) -> dict:
-    """Writes OUT/manifest.json: options, hashes of every scene, rejected draws, machine and versions."""
+    """Writes OUT/manifest.json: options, hashes of all scenes, rejected draws, machine and versions."""
     scenes = {}
     for folder in folders:
         metadata = read_metadata(folder)
@@ -174,7 +173,7 @@ def write_manifest(out: Path, folders: list[Path], settings: dict) -> dict:
 
 
 def rejected_draws(folders: list[Path]) -> dict[str, int]:
-    """Number of draws that could not be used, by reason."""
+    """Reason -> number of rejected draws."""
     return dict(Counter(reason for folder in folders for reason in read_metadata(folder)["rejected"]))
 
 

@@ -1,1 +1,1 @@
-"""Invariances, stress tests and approximation errors of a model."""
+"""Invariances, stress tests and approximation errors of a simulator."""

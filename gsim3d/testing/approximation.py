@@ -1,7 +1,7 @@
-"""Approximation error of an asymmetric background, and of sleep, against computing everything.
+"""Approximation errors of sleep and of an asymmetric background.
 
-compare_backgrounds(simulator, state, 12, cameras)   # an asymmetric model and its weights in a symmetric one
-compare_sleep(simulator, state, 12, plan, cameras)   # a plan with sleep and one without
+compare_sleep(simulator, state, 12, plan, cameras)   # a plan with sleep against the same plan without
+compare_backgrounds(simulator, state, 12, cameras)   # an asymmetric model against a symmetric one with its weights
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from gsim3d.state import FROZEN, Particles
 
 @dataclass(frozen=True)
 class SleepError:
-    """The error of sleep, one number per step.
+    """Error of sleep at each step.
 
     Attributes:
-        moved: metres, the largest distance between the two positions of a particle.
-        psnr: dB between their images, inf where equal.
-        log: particles that rested.
+        moved: largest distance of a particle from the rollout without sleep, in metres.
+        psnr: PSNR between the images in dB, inf if equal.
+        log: counts of computed particles.
     """
 
     moved: tuple[float, ...]
@@ -38,14 +38,14 @@ class SleepError:
 
 @dataclass(frozen=True)
 class BackgroundError:
-    """The error of an asymmetric background, one number per step.
+    """Error of an asymmetric background at each step.
 
     Attributes:
-        moved: metres, mean distance between the two positions of a moving particle.
-        psnr: dB between their images.
-        shadow: mean change of a latent of the background in the symmetric model, such as by a shadow; in the asymmetric
-            one it does not change.
-        shadow_psnr: dB between images of the symmetric model with and without these changes.
+        moved: mean distance of moving particles between the two models, in metres.
+        psnr: PSNR between the images in dB.
+        shadow: mean absolute change of the background's latents in the symmetric model, for example by shadows; 0 in
+            the asymmetric model.
+        shadow_psnr: PSNR in dB between images of the symmetric model with and without these changes.
     """
 
     moved: tuple[float, ...]
@@ -58,14 +58,17 @@ class BackgroundError:
 def compare_sleep(
     simulator: Simulator, state: Particles, n_steps: int, plan: Plan, cameras: Cameras | None = None
 ) -> SleepError:
-    """The error of sleep in a rollout of ``n_steps``.
+    """Compares a rollout with sleep to one without.
 
     Args:
-        plan: with sleep.
-        cameras: as in :meth:`Simulator.render` of a step; None: no images are compared.
+        simulator: simulator to test.
+        state: initial state.
+        n_steps: steps of the rollout.
+        plan: plan with sleep.
+        cameras: cameras of the compared images; None: no images.
     """
     if plan.spec.dynamics.sleep is None:
-        raise InputError("compare_sleep: plan must be one with dynamics.sleep")
+        raise InputError("compare_sleep: the plan must have dynamics.sleep")
     awake = dataclasses.replace(plan.spec, dynamics=dataclasses.replace(plan.spec.dynamics, sleep=None))
     log = RestLog()
     steps = simulator.rollout(state, n_steps, plan, log=log)
@@ -80,11 +83,14 @@ def compare_sleep(
 def compare_backgrounds(
     simulator: Simulator, state: Particles, n_steps: int, cameras: Cameras, plan: Plan | None = None
 ) -> BackgroundError:
-    """The error of an asymmetric background in a rollout of ``n_steps``.
+    """Compares a rollout of an asymmetric model to one of a symmetric model with the same weights.
 
     Args:
-        simulator: of an asymmetric model.
-        cameras: as in :meth:`Simulator.render` of a step.
+        simulator: simulator with an asymmetric background.
+        state: initial state.
+        n_steps: steps of the rollout.
+        cameras: cameras of the compared images.
+        plan: what to compute; None: the simulator's default.
     """
     config = simulator.config
     if not config.dynamics.is_asymmetric:

@@ -1,4 +1,4 @@
-"""What is installed, compiled and missing, and a self-test of every op (``gsim3d doctor``); works without torch."""
+"""Checks of the installation and self-tests of all ops (``gsim3d doctor``). Works without torch."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import platform
 import sys
 import time
 
-# distribution -> (import name, what it is for, how to get it)
+# distribution -> (import name, purpose, install command)
 OPTIONAL = {
     "mujoco-core": ("mujoco", "generate: physics", "pip install 'gsim3d[generate]'"),
     "embreex": ("embreex", "generate: ray tracing", "pip install 'gsim3d[generate]'"),
@@ -20,7 +20,7 @@ REQUIRED = ["torch", "numpy", "opencv-contrib-python-headless", "pyyaml", "safet
 
 
 def check_installation() -> bool:
-    """Prints a line for every package, compiled module and op; returns whether all that is required works."""
+    """Prints a line for every package, compiled module and op. Returns whether all required ones work."""
     versions, compiled = _versions(), _compiled()
     return versions and compiled
 
@@ -46,7 +46,7 @@ def _versions() -> bool:
     healthy = True
     for name in REQUIRED:
         version = _version(name)
-        if version is None and name.startswith("opencv"):  # any build of OpenCV's wheel serves
+        if version is None and name.startswith("opencv"):  # any OpenCV wheel will do
             version = next(filter(None, map(_version, ("opencv-python", "opencv-python-headless"))), None)
         healthy &= version is not None
         _row("ok" if version else "FAIL", name, version or f"missing: pip install {name}")

@@ -1,11 +1,11 @@
-"""Invariances of a simulator with any weights, as metamorphic tests: the transformed scene has the transformed future.
+"""Invariances of a simulator with any weights, as metamorphic tests: a transformed input gives the transformed output.
 
     for deviation in INVARIANCES["permute particles"](simulator, sample):
         assert deviation.holds, deviation
 
-Each invariance is exact where the same sums are formed, and holds to a bound where they are formed in another order or
-at another position. A rollout amplifies rounding as the world does, so invariances with a bound are checked step by
-step, each from one state; exact ones are checked on the whole rollout.
+An invariance is exact if it keeps all sums, and holds to a bound if their order or the positions change. Rollouts
+amplify rounding, so invariances with a bound are checked for each step of a rollout from the same state; exact ones are
+checked for the whole rollout.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ from gsim3d.nn.gaussian_head import render
 from gsim3d.simulator import Simulator
 from gsim3d.state import DYNAMIC, CloudTable, Gaussians, Particles, attributes_of, newest_clouds, take_runs
 
-EXACT = {torch.float32: 0.0, torch.float64: 1e-12}  # BLAS rounds a row of float64 as the number of rows suggests
-BOUND = 1e-4  # error over the largest value: float32 sums in another order; worst seen 7e-6, on small random models
-VELOCITY_BOUND = 1e-3  # velocities are fitted to pixels, and images of noise have no motion; worst seen 2.9e-4
-IMAGE_BOUND = 1e-3  # root mean square of a pixel's error: one splat whose alpha crosses 1/255 moves one pixel by 0.004
-GRAIN = 2.0**-18  # metres; positions are rounded to it before a scene is moved, so that sums of float32 are exact
-FROM_POSITIONS = (*attributes_of("point"), "velocity", "irradiance_gain", "light_occlusion")  # rounded as positions are
-FAR = 2.0**17  # cells: outside of the 2^16 that a grid has
+EXACT = {torch.float32: 0.0, torch.float64: 1e-12}  # rounding of BLAS in float64 depends on the number of rows
+BOUND = 1e-4  # error over the largest value, for float32 sums in another order; worst seen 7e-6, small random models
+VELOCITY_BOUND = 1e-3  # for velocities fitted to images of noise; worst seen 2.9e-4
+IMAGE_BOUND = 1e-3  # RMS error of an image: a splat whose alpha crosses 1/255 changes a pixel by 0.004
+GRAIN = 2.0**-18  # metres; positions are rounded to it before a translation, which is then exact in float32
+FROM_POSITIONS = (*attributes_of("point"), "velocity", "irradiance_gain", "light_occlusion")  # depend on positions
+FAR = 2.0**17  # cells, outside the 2^16 cells of a grid
 
 
 @dataclass(frozen=True)
 class Sample:
-    """What a check is applied to.
+    """Input of a check.
 
     Attributes:
-        frames: images of one or more scenes.
+        frames: input images of one or more scenes.
         targets: cameras to render; ``image_cloud`` is the scene of each.
-        n_steps: length of a rollout.
-        plan: what to compute; None: all that the model can.
+        n_steps: steps of a rollout.
+        plan: what to compute; None: the simulator's default.
     """
 
     frames: Frames
@@ -59,12 +59,12 @@ class Sample:
 
 @dataclass(frozen=True)
 class Deviation:
-    """How far one tensor is from its expected value.
+    """Error of a tensor against its expected value.
 
     Attributes:
-        what: the tensor.
-        error: relative to the largest expected value; absolute where every bit must agree.
-        bound: largest error that is allowed; 0: every bit must agree.
+        what: name of the tensor.
+        error: largest error over the largest expected value; absolute if ``bound`` is 0.
+        bound: largest allowed error; 0: equal bits.
         where: camera or particle of the largest error.
     """
 
@@ -86,10 +86,14 @@ Check = Callable[[Simulator, Sample], Iterator[Deviation]]
 
 
 def compare(what: str, actual: Tensor, expected: Tensor, bound: float, name_of: Callable[[int], str]) -> Deviation:
-    """The deviation of ``actual`` from ``expected``, both [N, ...]; values that are not finite are an infinite error.
+    """Deviation of ``actual`` from ``expected``, both [N, ...]. Non-finite values are an infinite error.
 
     Args:
-        name_of: index of the first dimension -> its name.
+        what: name of the tensor.
+        actual: computed values.
+        expected: expected values.
+        bound: largest allowed error; 0: equal bits.
+        name_of: index of the first dimension -> name.
     """
     if actual.shape != expected.shape:
         return Deviation(what, float("inf"), bound, f"shape {list(actual.shape)}, expected {list(expected.shape)}")
@@ -105,7 +109,7 @@ def compare(what: str, actual: Tensor, expected: Tensor, bound: float, name_of: 
 def compare_particles(
     what: str, actual: Particles, expected: Particles, bound: float, names: Sequence[str] = ()
 ) -> Iterator[Deviation]:
-    """Deviations of all floating-point attributes of particles, or of those in ``names``."""
+    """Deviations of all floating-point attributes, or of those in ``names``."""
     for name, value in expected.row_fields().items():
         if value.is_floating_point() and (not names or name in names):
             most = VELOCITY_BOUND if bound == BOUND and name == "velocity" else bound
@@ -113,7 +117,7 @@ def compare_particles(
 
 
 def compare_images(what: str, actual: Tensor, expected: Tensor, bound: float) -> Deviation:
-    """The deviation of images [I, H, W, 3]; with a bound: the root mean square error of the worst image."""
+    """Deviation of images [I, H, W, 3]; with a bound, the largest RMS error of an image."""
     if not bound or actual.shape != expected.shape:
         return compare(what, actual, expected, bound, lambda i: f"camera {i}")
     error = (actual.detach().double() - expected.detach().double()).square().flatten(1).mean(1).sqrt()
@@ -122,21 +126,21 @@ def compare_images(what: str, actual: Tensor, expected: Tensor, bound: float) ->
 
 
 def particle_name(particles: Particles, index: int) -> str:
-    """Scene, step and number in its cloud of a particle, such as "scene 0, step 3, particle 17"."""
+    """Name of a particle, such as "scene 0, step 3, particle 17"."""
     table = particles.clouds
     cloud = next(q for q in range(len(table)) if index < table.starts[q + 1])
     return f"scene {table.scenes[cloud]}, step {table.steps[cloud]}, particle {index - table.starts[cloud]}"
 
 
 def select_images(frames: Frames, images: Tensor, image_cloud: Tensor | None = None) -> Frames:
-    """``frames`` with ``images`` (int64 [J]) only, in that order, of the clouds ``image_cloud`` (None: as before)."""
+    """Selects ``images`` (int64 [J]) of ``frames``; ``image_cloud`` replaces their clouds (None: unchanged)."""
     maps = {name: getattr(frames, name) for name in ("images", "masks", "dynamic", "valid")}
     maps = {name: None if value is None else value[images] for name, value in maps.items()}
     return dataclasses.replace(frames, **maps, cameras=frames.cameras.select(images, image_cloud))
 
 
 def take_scenes(frames: Frames, scenes: Sequence[int]) -> Frames:
-    """The frames of ``scenes``, in that order; one may be taken several times."""
+    """Selects scenes of ``frames`` in the given order, with repetitions."""
     cloud_scene, image_cloud = frames.cloud_scene.tolist(), frames.cameras.image_cloud.tolist()
     clouds = [(new, q) for new, scene in enumerate(scenes) for q, own in enumerate(cloud_scene) if own == scene]
     images = [(i, new) for new, (_, q) in enumerate(clouds) for i, cloud in enumerate(image_cloud) if cloud == q]
@@ -153,7 +157,7 @@ def take_scenes(frames: Frames, scenes: Sequence[int]) -> Frames:
 
 
 def take_scenes_of_particles(particles: Particles, scenes: Sequence[int]) -> Particles:
-    """The particles of ``scenes``, in that order; one may be taken several times."""
+    """Selects scenes of ``particles`` in the given order, with repetitions."""
     own = particles.clouds.scenes
     new_scene, clouds = zip(*((new, q) for new, scene in enumerate(scenes) for q in range(len(own)) if own[q] == scene))
     return dataclasses.replace(
@@ -165,19 +169,19 @@ def take_scenes_of_particles(particles: Particles, scenes: Sequence[int]) -> Par
 
 
 def repack(particles: Particles, order: Tensor, counts: Iterable[int]) -> Particles:
-    """Particles number ``order`` (int64 [M]), ``counts`` of them in each cloud."""
+    """Gathers the particles ``order`` (int64 [M]) into clouds of ``counts`` particles."""
     table = CloudTable.make(counts, particles.clouds.scenes, particles.clouds.steps, order.device)
     return particles.with_clouds(table, **{name: value[order] for name, value in particles.row_fields().items()})
 
 
 def reordered(particles: Particles, order: Tensor) -> Particles:
-    """``particles`` whose i-th one is number ``order[i]`` (int64 [N]); clouds must stay together."""
+    """Permutes particles within their clouds: particle i of the result is ``order[i]`` (int64 [N])."""
     return dataclasses.replace(particles, **{name: value[order] for name, value in particles.row_fields().items()})
 
 
 def random_order(particles: Particles, seed: int = 0) -> Tensor:
-    """int64 [N], a permutation of the particles of each cloud, the same one for clouds of equal counts: in simulated
-    steps the n-th particle is the same throughout."""
+    """Random permutation of the particles of each cloud, int64 [N]; the same one for clouds of equal sizes, so that the
+    particles of simulated steps still correspond."""
     table = particles.clouds
     counts = [table.count(q) for q in range(len(table))]
     order = [torch.randperm(n, generator=torch.Generator().manual_seed(seed)) for n in counts]
@@ -186,14 +190,14 @@ def random_order(particles: Particles, seed: int = 0) -> Tensor:
 
 
 def move_cameras(cameras: Cameras, rotation: Tensor, translation: Tensor) -> Cameras:
-    """Cameras of a world moved by ``x -> rotation x + translation``, in float64."""
+    """Cameras after the world moved by ``x -> rotation x + translation``, in float64."""
     motion = torch.eye(4, dtype=torch.float64, device=rotation.device)
     motion[:3, :3], motion[:3, 3] = rotation.T, -rotation.T @ translation
     return dataclasses.replace(cameras, viewmats=cameras.viewmats.double() @ motion)
 
 
 def move_gaussians(gaussians: Gaussians, rotation: Tensor, translation: Tensor) -> Gaussians:
-    """Gaussians of a world moved by ``x -> rotation x + translation``: positions, rotations and harmonics."""
+    """Gaussians after the world moved by ``x -> rotation x + translation``."""
     quat = rotation_to_quat(rotation[None]).to(gaussians.quats)
     matrices = rotation.to(gaussians.sh).expand(gaussians.sh.shape[0], 3, 3)
     return dataclasses.replace(
@@ -205,7 +209,7 @@ def move_gaussians(gaussians: Gaussians, rotation: Tensor, translation: Tensor) 
 
 
 def random_motion(seed: int, like: Tensor) -> tuple[Tensor, Tensor]:
-    """A random rotation [3, 3] by 60 to 120 degrees, and a random translation [3] of about a metre."""
+    """Random rotation [3, 3] by 60 to 120 degrees and random translation [3] of about a metre."""
     g = torch.Generator().manual_seed(seed)
     quat = torch.randn(1, 4, generator=g, dtype=torch.float64)
     quat[0, 0] = quat[0, 1:].norm() * (0.6 + torch.rand((), generator=g, dtype=torch.float64))
@@ -214,19 +218,19 @@ def random_motion(seed: int, like: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def voxel_shift(simulator: Simulator, like: Tensor) -> Tensor:
-    """float64 [3] metres, about (2, -3, 1) in whole voxels, rounded to GRAIN."""
+    """Translation float64 [3] of about (2, -3, 1) metres in whole voxels, rounded to GRAIN."""
     grid = simulator.config.dynamics.grid_size
     cells = (torch.tensor([2.0, -3.0, 1.0], dtype=torch.float64) / grid).round()
     return ((cells * grid / GRAIN).round() * GRAIN).to(like.device)
 
 
 def on_grain(particles: Particles) -> Particles:
-    """``particles`` with positions rounded to multiples of GRAIN."""
+    """Rounds positions to multiples of GRAIN."""
     return _with_positions(particles, lambda positions: (positions / GRAIN).round() * GRAIN)
 
 
 def _with_positions(particles: Particles, change: Callable[[Tensor], Tensor]) -> Particles:
-    """``particles`` with changed attributes of kind "point"; ``change`` gets and returns float64."""
+    """Applies ``change`` (float64 -> float64) to all attributes of kind "point"."""
     points = {name: value for name in attributes_of("point") if (value := getattr(particles, name)) is not None}
     return dataclasses.replace(particles, **{name: change(x.double()).to(x.dtype) for name, x in points.items()})
 
@@ -237,7 +241,7 @@ def _moved(particles: Particles, shift: Tensor) -> Particles:
 
 
 def _states(simulator: Simulator, sample: Sample) -> Iterator[Particles]:
-    """The encoded state and the states of a rollout, each with its history."""
+    """Yields the encoded state and the states of a rollout, each with its history."""
     state = simulator.encode(sample.frames).detach()
     for step in range(sample.n_steps):
         yield state
@@ -250,7 +254,7 @@ def _future(simulator: Simulator, state: Particles, sample: Sample) -> list[Part
 
 
 def _exact(particles: Particles) -> float:
-    """The bound of sums that are equal on the CPU; the BLAS of a GPU rounds a row as the number of rows suggests."""
+    """Bound for sums that are equal on the CPU; rounding of BLAS on a GPU depends on the number of rows."""
     dtype = particles.means.dtype
     return BOUND if particles.means.is_cuda and dtype == torch.float32 else EXACT[dtype]
 
@@ -265,7 +269,7 @@ def _in_float64(cameras: Cameras) -> Cameras:
 
 @torch.no_grad()
 def repeat(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
-    """The same input twice: equal bits."""
+    """The same input twice gives equal bits."""
     state, again = (simulator.encode(sample.frames) for _ in range(2))
     yield from compare_particles("encode", again, state, 0)
     for step, other in zip(_future(simulator, state, sample), _future(simulator, again, sample), strict=True):
@@ -276,7 +280,7 @@ def repeat(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
 
 @torch.no_grad()
 def translate(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
-    """Scene, cameras and origin moved by whole voxels: the same particles there, the same images."""
+    """A translation of scene, cameras and origin by whole voxels translates particles and keeps images."""
     shift = voxel_shift(simulator, sample.frames.origin)
     still = torch.eye(3, dtype=torch.float64, device=shift.device)
     frames = dataclasses.replace(sample.frames, cameras=_in_float64(sample.frames.cameras))
@@ -300,7 +304,7 @@ def translate(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
 
 @torch.no_grad()
 def rotate(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
-    """Cameras rotated and moved together: depths stay; Gaussians and cameras moved together: images stay."""
+    """A rigid motion of all cameras keeps depths; one of Gaussians and cameras keeps images."""
     rotation, translation = random_motion(0, sample.frames.origin)
     frames = dataclasses.replace(sample.frames, cameras=_in_float64(sample.frames.cameras))
     moved = dataclasses.replace(frames, cameras=move_cameras(frames.cameras, rotation, translation))
@@ -318,7 +322,7 @@ def rotate(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
 
 @torch.no_grad()
 def permute_particles(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
-    """The particles of each cloud in another order: each has the same future, and the image stays."""
+    """A permutation of the particles of each cloud permutes the prediction and keeps images."""
     for state in _states(simulator, sample):
         order = random_order(state)
         step, other = (last_steps(simulator.step(s, sample.plan), 1) for s in (state, reordered(state, order)))
@@ -333,14 +337,14 @@ def permute_particles(simulator: Simulator, sample: Sample) -> Iterator[Deviatio
 
 @torch.no_grad()
 def permute_views(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
-    """The views of each step in another order: the same particles; target cameras in another order: the same images."""
+    """A permutation of the input views keeps the particles; one of the target cameras permutes the images."""
     frames = sample.frames
     n_images = len(frames.cameras)
     reverse = torch.arange(n_images - 1, -1, -1, device=frames.images.device)
     backwards = select_images(frames, reverse)
     state, other = simulator.encode(frames), simulator.encode(backwards)
     n_pixels = frames.images[0, 0].numel()
-    pixels = _pixels_of_particles(backwards)  # of the reversed images; of the images as they were:
+    pixels = _pixels_of_particles(backwards)  # of the reversed images
     pixels = (n_images - 1 - pixels // n_pixels) * n_pixels + pixels % n_pixels
     back = torch.argsort(pixels)[torch.argsort(torch.argsort(_pixels_of_particles(frames)))]
     yield from compare_particles("encode", reordered(other, back), state, BOUND)
@@ -351,16 +355,16 @@ def permute_views(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
 
 
 def _pixels_of_particles(frames: Frames) -> Tensor:
-    """int64 [N], image * H * W + pixel of each encoded particle."""
+    """image * H * W + pixel of each encoded particle, int64 [N]."""
     n_pixels = frames.images[0, 0].numel()
     order = torch.argsort(frames.cameras.image_cloud, stable=True)
     pixels = order[:, None] * n_pixels + torch.arange(n_pixels, device=order.device)
     return pixels.flatten() if frames.masks is None else pixels[frames.masks[order].flatten(1)]
 
 
-def _together_and_apart(simulator: Simulator, sample: Sample, scenes: Sequence[int]) -> Iterator[Deviation]:
-    """Deviations of ``scenes`` packed in that order from the whole sample: equal bits after the encoder, whose dense
-    convolutions round as the number of images suggests."""
+def _compare_batches(simulator: Simulator, sample: Sample, scenes: Sequence[int]) -> Iterator[Deviation]:
+    """Deviations of a batch of ``scenes`` from the whole sample. The encoder has a bound, since the rounding of dense
+    convolutions depends on the number of images."""
     state = simulator.encode(sample.frames)
     packed = take_scenes_of_particles(state, scenes)
     yield from compare_particles("encode", simulator.encode(take_scenes(sample.frames, scenes)), packed, BOUND)
@@ -379,26 +383,26 @@ def _together_and_apart(simulator: Simulator, sample: Sample, scenes: Sequence[i
 
 @torch.no_grad()
 def permute_scenes(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
-    """The scenes of a batch in another order: the same futures."""
-    yield from _together_and_apart(simulator, sample, range(sample.n_scenes - 1, -1, -1))
+    """A permutation of the scenes of a batch permutes the predictions."""
+    yield from _compare_batches(simulator, sample, range(sample.n_scenes - 1, -1, -1))
 
 
 @torch.no_grad()
 def repeat_scene(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
-    """A scene twice in the batch: the same future for both copies, and the others do not change."""
-    yield from _together_and_apart(simulator, sample, [*range(sample.n_scenes), 0])
+    """A scene that is twice in a batch has two equal predictions, and other scenes do not change."""
+    yield from _compare_batches(simulator, sample, [*range(sample.n_scenes), 0])
 
 
 @torch.no_grad()
 def split_batch(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
-    """Each scene alone: the same future as in the batch."""
+    """A scene alone has the same prediction as in a batch."""
     for scene in range(sample.n_scenes):
-        yield from _together_and_apart(simulator, sample, [scene])
+        yield from _compare_batches(simulator, sample, [scene])
 
 
 @torch.no_grad()
 def append_far_particle(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
-    """One more particle in each cloud, far outside the grid: it stays as it is, and the others do not change."""
+    """A particle far outside the grid does not change, and neither do the others."""
     state = simulator.encode(sample.frames).detach()
     far, exact = FAR * simulator.config.dynamics.grid_size, _exact(state)
     grown = _with_far_particle(state, far)
@@ -417,7 +421,7 @@ def _beyond(particles: Particles, far: float, wanted: bool = True) -> Particles:
 
 
 def _with_far_particle(state: Particles, far: float) -> Particles:
-    """``state`` and at the end of each cloud that is not empty a copy of its first particle, ``far`` metres away."""
+    """Appends to each non-empty cloud a copy of its first particle, ``far`` metres away."""
     order, is_copy, counts = [], [], []
     for begin, end in pairwise(state.clouds.starts):
         rows = [*range(begin, end), *range(begin, min(begin + 1, end))]

@@ -1,5 +1,4 @@
-"""Invariances and stress tests of a user's model and scenes (``gsim3d doctor --stability``): a report, and a file that
-reproduces each failure."""
+"""Invariances and stress tests of a model on scenes, with files that reproduce failures (``gsim3d doctor``)."""
 
 from __future__ import annotations
 
@@ -35,27 +34,28 @@ from gsim3d.train.restore import PRESETS, Restored, build_simulator, restore
 from gsim3d.train.samples import context_cameras, spread_views, subsampled
 
 CHECKS = {**INVARIANCES, **STRESS_TESTS}
-LONG, SHORT = "a long rollout", 3  # steps of all other checks
+LONG = "a long rollout"
+SHORT = 3  # steps of all other checks
 N_STEPS = 100
-MAX_SCENES, MAX_HISTORY, MAX_PIXELS = 2, 2, 150  # what a quick check computes with (pixels of an image)
-FULL_VIEWS = 4  # of a full one, which has every particle
+MAX_SCENES, MAX_HISTORY, MAX_PIXELS = 2, 2, 150  # scenes, input steps, and pixels of an image, of a quick check
+FULL_VIEWS = 4  # views of a full check
 FORMAT = 1
-RANDOM_SIZE = 32  # pixels of the images that are made where there are none
+RANDOM_SIZE = 32  # width and height of random images
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What one check found.
+    """Result of a check.
 
     Attributes:
-        check: its name.
-        outcome: "holds", "fails", "known failure" (the model card has it) or "not promised".
-        n_compared: number of deviations.
+        check: name of the check.
+        outcome: "holds", "fails", "known failure" (listed in the model card) or "not promised".
+        n_compared: number of compared tensors.
         seconds: duration of the check.
-        worst: the deviation nearest to, or farthest beyond, its bound.
-        failures: deviations that do not hold.
-        file: reproduces the failures.
-        reason: why it is not promised, or what the model card says.
+        worst: deviation with the largest error relative to its bound.
+        failures: deviations above their bounds.
+        file: file that reproduces the failures.
+        reason: why the check is not promised, or the entry of the model card.
     """
 
     check: str
@@ -70,12 +70,12 @@ class Finding:
 
 @dataclass(frozen=True)
 class Report:
-    """What all checks found.
+    """Results of all checks.
 
     Attributes:
-        subject: what was checked, by name.
-        problems: of scenes that could not be read.
-        findings: one per check.
+        subject: description of the model and its inputs.
+        problems: problems of scenes that could not be read.
+        findings: one finding for each check.
     """
 
     subject: dict[str, str]
@@ -92,10 +92,10 @@ class Subject:
     """A simulator to check.
 
     Attributes:
-        simulator: the model.
-        origin: checkpoint or preset that it was made from.
-        restored: its checkpoint; None: random weights.
-        known: check -> failure that the model card has.
+        simulator: the simulator.
+        origin: its checkpoint or preset.
+        restored: restored checkpoint; None: random weights.
+        known: check -> failure listed in the model card.
     """
 
     simulator: Simulator
@@ -104,7 +104,7 @@ class Subject:
     known: dict[str, dict] = dataclasses.field(default_factory=dict)
 
     def sample(self, frames: Frames, targets: Cameras, n_steps: int = SHORT) -> Sample:
-        """The sample of these images on the simulator's device, with the plan that it was trained for."""
+        """A sample on the simulator's device, with the plan of its training."""
         device = next(self.simulator.parameters()).device
         plan = self.restored.plan if self.restored else None
         return Sample(frames.to(device), targets.to(device), n_steps, plan)
@@ -118,7 +118,7 @@ def is_checkpoint(path: Path) -> bool:
 
 
 def open_subject(path: str | Path | None, device: str = "cpu") -> Subject:
-    """The simulator of a checkpoint, or of a preset (None: "tiny") with random weights of which none is zero."""
+    """Opens a checkpoint, or builds a preset (None: "tiny") with nonzero random weights."""
     preset = "tiny" if path is None else str(path)
     if preset not in PRESETS:
         restored = restore(path, device)
@@ -133,10 +133,12 @@ def open_subject(path: str | Path | None, device: str = "cpu") -> Subject:
 
 
 def sample_of_scenes(subject: Subject, folders: Sequence[Path], full: bool = False) -> tuple[Sample | None, list[str]]:
-    """First steps and evenly spread views of up to two scenes that load; problems of those that do not.
+    """Sample of the first steps of up to two valid scenes (None: no scene is valid), and problems of invalid ones.
 
     Args:
-        full: four views, the whole history and all particles, instead of few of each.
+        subject: simulator to check.
+        folders: scene folders.
+        full: uses four views, the whole history and all particles.
     """
     scenes, problems = [], []
     for folder in folders:
@@ -170,7 +172,7 @@ def _views(subject: Subject, scene: Scene, count: int | None = None) -> list[int
 
 
 def random_sample(subject: Subject) -> Sample:
-    """Two scenes of random images with two and one steps, three cameras on a ring around the origin each."""
+    """Sample of random images: two scenes with two and one steps and three cameras on a ring."""
     size = (RANDOM_SIZE, RANDOM_SIZE) if subject.restored is None else subject.restored.image_size
     generator = torch.Generator().manual_seed(0)
     n_steps = (min(MAX_HISTORY, 2**subject.simulator.config.dynamics.history_bits), 1)
@@ -201,7 +203,7 @@ def random_sample(subject: Subject) -> Sample:
 
 
 def _subsampled(frames: Frames) -> Frames:
-    """``frames`` whose masks keep at most MAX_PIXELS of an image, evenly spread."""
+    """Reduces the masks to at most MAX_PIXELS evenly spaced pixels of each image."""
     kept = torch.ones_like(frames.images[:, 0], dtype=torch.bool) if frames.masks is None else frames.masks
     number = kept.flatten(1).cumsum(1)
     every = (number[:, -1:] + MAX_PIXELS - 1).div(MAX_PIXELS, rounding_mode="floor").clamp(min=1)
@@ -209,7 +211,7 @@ def _subsampled(frames: Frames) -> Frames:
 
 
 def _first_cameras(frames: Frames) -> Cameras:
-    """The cameras of the first step of every scene; ``image_cloud`` is the scene of each."""
+    """Cameras of the first step of every scene; ``image_cloud`` is the scene."""
     scene_of_image = frames.cloud_scene[frames.cameras.image_cloud]
     first = (frames.cloud_step[frames.cameras.image_cloud] == 0).nonzero()[:, 0]
     return frames.cameras.select(first, scene_of_image[first])
@@ -222,23 +224,26 @@ def check(
     only: Sequence[str] = (),
     on_check: Callable = lambda name: None,
 ) -> Iterator[tuple[Finding, Sample]]:
-    """The finding of every check, or of those in ``only``, with the sample it was applied to.
+    """Runs all checks, or those in ``only``, and yields each finding with its sample.
 
     Args:
-        n_steps: of the long rollout.
+        subject: simulator to check.
+        sample: input of the checks.
+        n_steps: steps of the long rollout.
+        only: names of checks; empty: all.
         on_check: called with the name of each check before it runs.
     """
-    released = isinstance(subject.simulator, ReleasedSimulator)  # the clouds of a call change each other
+    released = isinstance(subject.simulator, ReleasedSimulator)  # its clouds are not independent
     for name in only or CHECKS:
         on_check(name)
         tried = dataclasses.replace(sample, n_steps=n_steps if name == LONG else SHORT)
         if released and name in INVARIANCES and name != "repeat":
-            yield Finding(name, "not promised", reason="the model repeats the behaviour of the release"), tried
+            yield Finding(name, "not promised", reason="the published model does not have this invariance"), tried
             continue
         start, crash, deviations = time.perf_counter(), None, []
         try:
             deviations.extend(CHECKS[name](subject.simulator, tried))
-        except Exception as error:  # is a finding; the other checks go on
+        except Exception as error:  # counts as a failure of this check
             message = " ".join(str(error).split())[:300]
             crash = Deviation(f"ends with {type(error).__name__}", math.inf, 0.0, message)
             deviations.append(crash)
@@ -253,10 +258,12 @@ def check(
 
 
 def save_sample(path: Path, sample: Sample, what: dict) -> None:
-    """Writes the sample of a check: all that it depends on besides the model.
+    """Writes the sample of a check to a .safetensors file.
 
     Args:
-        what: name of the check, and origin of the model.
+        path: file to write.
+        sample: input of the check.
+        what: name of the check and origin of the model.
     """
     parts = {"frames": sample.frames, "cameras": sample.frames.cameras, "targets": sample.targets}
     tensors = {f"{part}.{k}": v for part, of in parts.items() for k, v in vars(of).items() if isinstance(v, Tensor)}
@@ -267,9 +274,9 @@ def save_sample(path: Path, sample: Sample, what: dict) -> None:
 
 
 def load_sample(path: str | Path) -> tuple[Sample, dict]:
-    """The sample and ``what`` of :func:`save_sample`. Raises InputError where ``path`` is no such file."""
+    """Reads sample and ``what`` of :func:`save_sample`. Raises InputError for other files."""
     try:
-        if not Path(path).is_file():  # a pipe would be waited for
+        if not Path(path).is_file():  # reading a pipe would block
             raise InputError(f"{path}: no such file")
         with safe_open(path, "pt") as file:
             what = json.loads((file.metadata() or {})["gsim3d_stability"])
@@ -288,7 +295,7 @@ def load_sample(path: str | Path) -> tuple[Sample, dict]:
 
 
 def write_report(report: Report, out: Path) -> None:
-    """Writes report.md and report.json into ``out``."""
+    """Writes report.md and report.json to the folder ``out``."""
     lines = ["# Stability", "", *(f"- {name}: {value}" for name, value in report.subject.items()), ""]
     if report.problems:
         lines += ["## Scenes that cannot be read", "", *(f"- {problem}" for problem in report.problems), ""]
@@ -302,14 +309,14 @@ def write_report(report: Report, out: Path) -> None:
             lines += ["", f"## {finding.check}", "", (CHECKS[finding.check].__doc__ or "").strip(), ""]
             lines += [f"- {deviation}" for deviation in finding.failures[:20]]
             lines += [f"- and {more} more"] if (more := len(finding.failures) - 20) > 0 else []
-            lines += ["", f"Again: `gsim3d doctor --stability --replay {finding.file}`"]
+            lines += ["", f"Reproduce: `gsim3d doctor --stability --replay {finding.file}`"]
     plain = _plain({"healthy": report.healthy, **dataclasses.asdict(report)})
     for name, content in {"report.md": "\n".join(lines), "report.json": json.dumps(plain, indent=1)}.items():
         write_whole(out / name, content, "\n")
 
 
 def _plain(value: Any) -> Any:
-    """``value`` whose infinite numbers are texts, for JSON."""
+    """Converts infinite numbers to strings, for JSON."""
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, (tuple, list)):
@@ -317,75 +324,69 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, float) and not value < math.inf else value
 
 
-@dataclass(frozen=True)
-class Job:
-    """Options of ``gsim3d doctor --stability``.
+def check_stability(
+    paths: Sequence[str],
+    out: Path,
+    *,
+    n_steps: int = N_STEPS,
+    only: Sequence[str] = (),
+    device: str = "cpu",
+    full: bool = False,
+    quiet: bool = False,
+) -> Report:
+    """Runs the checks and writes the report, and a file that reproduces each failure.
 
-    Attributes:
-        paths: a checkpoint, and a scene or folder of scenes, in any order; none: random weights and images.
+    Args:
+        paths: a checkpoint and a scene or folder of scenes, in any order; none: random weights and images.
         out: folder of the report.
-        n_steps: of the long rollout.
+        n_steps: steps of the long rollout.
         only: names of checks; empty: all.
         device: "cpu" or "cuda".
-        progress: whether a bar is shown.
-        full: all particles, four views and the model's whole history.
-    """
-
-    paths: Sequence[str] = ()
-    out: Path = Path("runs/stability")
-    n_steps: int = N_STEPS
-    only: Sequence[str] = ()
-    device: str = "cpu"
-    progress: bool = True
-    full: bool = False
-
-
-def check_stability(job: Job) -> Report:
-    """Runs the checks; writes and returns the report, and writes a file that reproduces each failure.
-
+        quiet: hides the progress bar.
+        full: uses all particles, four views and the model's whole history.
     Raises:
         InputError: a path is neither a checkpoint nor a scene nor a folder of scenes, or a check is unknown.
     """
-    if unknown := [name for name in job.only if name not in CHECKS]:
+    if unknown := [name for name in only if name not in CHECKS]:
         raise InputError(
             f"--only: unknown check {unknown[0]!r}; checks: {', '.join(CHECKS)}{did_you_mean(unknown[0], CHECKS)}"
         )
-    if job.n_steps < 1:
-        raise InputError(f"--steps must be at least 1; got {job.n_steps}")
-    paths = [located(path) if str(path) in names() else Path(path) for path in job.paths]
+    if n_steps < 1:
+        raise InputError(f"--steps must be at least 1; got {n_steps}")
+    found = [located(path) if str(path) in names() else Path(path) for path in paths]
     named = [*names(), *PRESETS]
-    for path in paths:
+    for path in found:
         if not path.exists() and str(path) not in PRESETS:
             raise InputError(f"{path}: no such file or folder{did_you_mean(path, named)}")
-    checkpoints = [path for path in paths if str(path) in PRESETS or is_checkpoint(path)]
-    others = [path for path in paths if path not in checkpoints]
+    checkpoints = [path for path in found if str(path) in PRESETS or is_checkpoint(path)]
+    others = [path for path in found if path not in checkpoints]
     if len(checkpoints) > 1 or len(others) > 1:
         raise InputError("--stability takes one checkpoint, and one scene or folder of scenes")
-    if job.full and not others:
+    if full and not others:
         raise InputError("--full needs scenes: gsim3d doctor --stability NAME DATA --full")
     folders = find_scenes(others[0]) if others else []
-    subject = open_subject(checkpoints[0] if checkpoints else None, job.device)
+    subject = open_subject(checkpoints[0] if checkpoints else None, device)
     origin = subject.origin | ({"scenes": str(others[0])} if others else {"scenes": "random images"})
-    sample, problems = sample_of_scenes(subject, folders, job.full) if folders else (random_sample(subject), [])
+    sample, problems = sample_of_scenes(subject, folders, full) if folders else (random_sample(subject), [])
     findings: list[Finding] = []
     if sample is not None:
-        (job.out / "failures").mkdir(parents=True, exist_ok=True)
-        with progress(None, "checks", len(job.only or CHECKS), unit="check", quiet=not job.progress) as bar:
-            for finding, tried in check(subject, sample, job.n_steps, job.only, bar.set_description):
+        (out / "failures").mkdir(parents=True, exist_ok=True)
+        with progress(None, "checks", len(only or CHECKS), unit="check", quiet=quiet) as bar:
+            for finding, tried in check(subject, sample, n_steps, only, bar.set_description):
                 if finding.failures:
-                    file = job.out / "failures" / f"{finding.check.replace(' ', '_')}.safetensors"
+                    file = out / "failures" / f"{finding.check.replace(' ', '_')}.safetensors"
                     save_sample(file, tried, {"check": finding.check, **subject.origin})
                     finding = dataclasses.replace(finding, file=str(file))
                 findings.append(finding)
                 bar.update()
     report = Report(origin, tuple(problems), tuple(findings))
-    job.out.mkdir(parents=True, exist_ok=True)
-    write_report(report, job.out)
+    out.mkdir(parents=True, exist_ok=True)
+    write_report(report, out)
     return report
 
 
 def replay(path: str | Path, device: str = "cpu") -> Report:
-    """The report of the check that a file reproduces, on the model that it names."""
+    """Runs the check of a file of :func:`save_sample` on the model that it names."""
     sample, what = load_sample(path)
     subject = open_subject(what.get("checkpoint") or what["preset"].partition(",")[0], device)
     sample = subject.sample(sample.frames, sample.targets, sample.n_steps)
@@ -394,7 +395,7 @@ def replay(path: str | Path, device: str = "cpu") -> Report:
 
 
 def describe(report: Report) -> str:
-    """The report as the terminal shows it."""
+    """The report as text for a terminal."""
     lines = [f"{name}: {value}" for name, value in report.subject.items()]
     lines += [f"  FAIL problem: {problem}" for problem in report.problems]
     marks = {"holds": "ok", "fails": "FAIL", "known failure": "FAIL", "not promised": "-"}
@@ -405,7 +406,7 @@ def describe(report: Report) -> str:
         lines.append(f"  {mark:<4} {finding.check:<24} {what}")
         lines += [f"       {deviation}" for deviation in finding.failures[:3]]
         if finding.file:
-            lines.append(f"       again: gsim3d doctor --stability --replay {finding.file}")
+            lines.append(f"       reproduce: gsim3d doctor --stability --replay {finding.file}")
     count = [finding.outcome for finding in report.findings].count
     if known := count("known failure"):
         new = f"{count('fails')} more" if count("fails") else "no other"

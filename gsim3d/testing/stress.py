@@ -1,6 +1,6 @@
-"""Stress tests of a simulator: curves over a long rollout, gradients through it, and hard inputs made of a sample.
+"""Stress tests of a simulator: long rollouts, gradients through rollouts, and degenerate inputs.
 
-The checks have the form of those in :mod:`gsim3d.testing.invariances`: (simulator, sample) -> deviations.
+As in :mod:`gsim3d.testing.invariances`, a check is a function (simulator, sample) -> deviations.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from gsim3d.testing.invariances import (
     take_scenes_of_particles,
 )
 
-MAX_MASS_DRIFT = 0.01  # relative change of the sum of opacities in a rollout of a model that does not predict them
+MAX_MASS_DRIFT = 0.01  # largest relative change of the sum of opacities, if they are not predicted
 GRADIENT_STEPS = 12
 
 
 @dataclass(frozen=True)
 class Curves:
-    """One number per step, over all scenes.
+    """Statistics of each step over all scenes.
 
     Attributes:
-        kinetic_energy: (m/step)^2, for unit masses.
+        kinetic_energy: in (m/step)^2, for unit masses.
         opacity_mass: sum of opacities.
-        extent: metres, diagonal of the bounds of the largest scene.
-        speed: m/step, the largest displacement of a particle.
-        awake: particles that may still change.
+        extent: diagonal of the bounding box of the largest scene in metres.
+        speed: largest displacement of a particle in m/step.
+        awake: number of awake particles.
     """
 
     kinetic_energy: list[float]
@@ -56,9 +56,13 @@ class Curves:
 def rollout_curves(
     simulator: Simulator, state: Particles, n_steps: int, plan: Plan | None = None, on_step=None
 ) -> Curves:
-    """Curves of a rollout of any length, in the memory of one step.
+    """Statistics of a rollout, computed in the memory of one step.
 
     Args:
+        simulator: simulator to test.
+        state: initial state.
+        n_steps: steps of the rollout.
+        plan: what to compute; None: the simulator's default.
         on_step: called with the newest particles after each step.
     Raises:
         NumericalError: as :meth:`Simulator.step`.
@@ -85,11 +89,11 @@ def rollout_curves(
 def gradient_norms(
     simulator: Simulator, state: Particles, targets: Cameras, n_steps: int, plan: Plan | None = None
 ) -> tuple[list[float], dict[str, Tensor]]:
-    """Gradients of the image of the last step of a rollout.
+    """Gradients of the mean squared image of the last step of a rollout.
 
     Returns:
-        The norm of the gradient of the image's mean squared value with respect to the state (positions and dynamic
-        latents) before step 1, 2, ... ``n_steps``; and its gradient with respect to every parameter that has one.
+        Norms of the gradients with respect to the state (positions and dynamic latents) before each step, and
+        parameter -> gradient.
     """
     state = state.detach()
     taps = []
@@ -110,7 +114,7 @@ def _holds(what: str, ok: bool, where: str) -> Deviation:
 
 
 def _finite(what: str, particles: Particles) -> Iterator[Deviation]:
-    """Whether each attribute is finite; names the first particle that is not."""
+    """Checks that each attribute is finite; names the first particle that is not."""
     for name, value in particles.row_fields().items():
         if value.is_floating_point() and value.numel():
             bad = ~value.detach().reshape(len(value), -1).isfinite().all(1)
@@ -125,8 +129,8 @@ def _finite_image(what: str, simulator: Simulator, particles: Particles, cameras
     return _holds(f"{what} image is finite", not bool(bad.any()), f"camera {camera}")
 
 
-def _goes_through(what: str, simulator: Simulator, frames: Frames, sample: Sample) -> Iterator[Deviation]:
-    """Whether encoded particles, their rollout and its image are finite."""
+def _runs_finite(what: str, simulator: Simulator, frames: Frames, sample: Sample) -> Iterator[Deviation]:
+    """Checks that encoded particles, their rollout and its image are finite."""
     state = simulator.encode(frames)
     yield from _finite(f"{what}: encoded", state)
     steps = simulator.rollout(state, sample.n_steps, sample.plan, report=StabilityReport())
@@ -136,30 +140,30 @@ def _goes_through(what: str, simulator: Simulator, frames: Frames, sample: Sampl
 
 @torch.no_grad()
 def images(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
-    """Black, white and grey images, and images whose masks are empty: finite particles, rollouts and images."""
+    """Black, white and grey images, and empty masks: particles, rollouts and images are finite."""
     frames = sample.frames
     for name, value in {"black": 0.0, "white": 1.0, "grey": 0.5}.items():
         painted = dataclasses.replace(frames, images=torch.full_like(frames.images, value))
-        yield from _goes_through(f"{name} images", simulator, painted, sample)
+        yield from _runs_finite(f"{name} images", simulator, painted, sample)
     none = torch.zeros_like(frames.images[:, 0], dtype=torch.bool)
-    yield from _goes_through("nothing kept", simulator, dataclasses.replace(frames, masks=none), sample)
+    yield from _runs_finite("nothing kept", simulator, dataclasses.replace(frames, masks=none), sample)
 
 
 @torch.no_grad()
 def few_views(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
-    """Each step seen by one camera only, and by the same camera twice: finite."""
+    """One camera a step, and the same camera twice: particles, rollouts and images are finite."""
     frames = sample.frames
     cloud = frames.cameras.image_cloud.tolist()
     firsts = [cloud.index(q) for q in sorted(set(cloud))]
     chosen = {"one camera": firsts, "the same camera twice": [i for first in firsts for i in (first, first)]}
     for name, images in chosen.items():
         few = select_images(frames, torch.tensor(images, device=frames.images.device))
-        yield from _goes_through(name, simulator, few, sample)
+        yield from _runs_finite(name, simulator, few, sample)
 
 
 @torch.no_grad()
 def not_a_number(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
-    """NaN in a pixel, a camera and a particle: errors that name them, or a particle that sleeps (on_invalid="drop")."""
+    """NaN or infinity in a pixel, a camera and a particle: an error names it, or the particle sleeps ("drop")."""
     frames = sample.frames
     last = len(frames.cameras) - 1
     pixels, viewmats = frames.images.clone(), frames.cameras.viewmats.clone()
@@ -170,7 +174,7 @@ def not_a_number(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
         "a camera": dataclasses.replace(frames, cameras=dataclasses.replace(frames.cameras, viewmats=viewmats)),
     }
     for name, bad in broken.items():
-        yield _refuses(f"{name} that is no number", lambda bad=bad: simulator.encode(bad), f"image {last}")
+        yield _refuses(f"{name} that is not finite", lambda bad=bad: simulator.encode(bad), f"image {last}")
     state = simulator.encode(frames).detach()
     if not state.n_rows:
         return
@@ -183,11 +187,11 @@ def not_a_number(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
     def rollout() -> None:
         report = StabilityReport()
         simulator.rollout(bad, 1, sample.plan, on_invalid="raise", report=report)
-        report.check()  # a GPU is not waited for before
+        report.check()  # synchronizes
 
-    yield _refuses("a particle that is no number", rollout, f"scene {scene}")
+    yield _refuses("a particle that is not finite", rollout, f"scene {scene}")
     steps = simulator.rollout(bad, sample.n_steps, sample.plan, on_invalid="drop", report=StabilityReport())
-    yield from _finite(f"on_invalid='drop' with {name} no number: rollout's", steps[-1])
+    yield from _finite(f"on_invalid='drop' with {name} not finite: rollout's", steps[-1])
     if sample.n_scenes > 1 and simulator.config.dynamics.origin_of_scene:
         clean = simulator.rollout(state, sample.n_steps, sample.plan)
         for step, expected in zip(steps, clean, strict=True):
@@ -199,22 +203,22 @@ def not_a_number(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
 
 
 def _refuses(what: str, call: Callable, names: str) -> Deviation:
-    """Whether ``call`` raises a NumericalError that names the scene, image or camera."""
+    """Checks that ``call`` raises a NumericalError whose message contains ``names``."""
     message = ""
     try:
         call()
     except NumericalError as error:
         message = str(error)
-    where = f"{names}; it says: {message}" if message else f"{names}; there was no error"
+    where = f"{names}; message: {message}" if message else f"{names}; no error"
     return _holds(f"{what}: a NumericalError names it", names in message, where)
 
 
 @torch.no_grad()
 def crowds(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
-    """One particle, all particles at one position, and every particle twice: finite rollouts and images."""
+    """One particle, all particles at one position, and every particle twice: rollouts and images are finite."""
     state = simulator.encode(sample.frames).detach()
     counts = [state.clouds.count(q) for q in range(state.n_clouds)]
-    first = state.cu_rows[state.row_cloud()]  # of the cloud of each particle
+    first = state.cu_rows[state.row_cloud()]  # first particle of each particle's cloud
     number = torch.arange(state.n_rows, device=first.device)
     crowds = {
         "one particle": state.select_rows(number == first),
@@ -229,7 +233,7 @@ def crowds(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
 
 @torch.no_grad()
 def strange_cameras(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
-    """A camera inside a particle, one facing away, one a thousand kilometres away: finite images."""
+    """Cameras inside a particle, facing away, and 1000 km away: images are finite."""
     newest = last_steps(simulator.encode(sample.frames).detach(), 1)
     targets = sample.targets.select(torch.zeros(1, dtype=torch.int64, device=newest.means.device))
     if not newest.n_rows:
@@ -239,21 +243,21 @@ def strange_cameras(simulator: Simulator, sample: Sample) -> Iterator[Deviation]
     away, far = targets.viewmats.clone(), targets.viewmats.clone()
     away[0, 1:3] = -away[0, 1:3]
     far[0, 2, 3] += 1e6
-    strange = {"inside of a particle": inside, "looking away": away, "a thousand kilometres off": far}
+    strange = {"inside a particle": inside, "facing away": away, "1000 km away": far}
     for name, viewmats in strange.items():
         camera = dataclasses.replace(targets, viewmats=viewmats)
         yield _finite_image(f"a camera {name}:", simulator, newest, camera)
 
 
 def long_rollout(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
-    """A long rollout is finite and bounded: speed, extent, and opacity where the model does not predict it."""
+    """A long rollout is finite, with bounded speed and, if opacities are not predicted, constant opacity mass."""
     state, bad = simulator.encode(sample.frames).detach(), []
 
-    def look(newest: Particles) -> None:
+    def collect(newest: Particles) -> None:
         bad.extend(deviation for deviation in _finite("rollout's", newest) if not deviation.holds)
 
     with torch.no_grad():
-        curves = rollout_curves(simulator, state, sample.n_steps, sample.plan, look)
+        curves = rollout_curves(simulator, state, sample.n_steps, sample.plan, collect)
     yield bad[0] if bad else _holds("every step of the rollout is finite", True, f"{sample.n_steps} steps")
     numbers = [*curves.kinetic_energy, *curves.extent]
     yield _holds("energy and extent are finite", all(map(math.isfinite, numbers)), f"{sample.n_steps} steps")
@@ -268,7 +272,7 @@ def long_rollout(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
 
 
 def gradients(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
-    """Gradients of the last image with respect to every state before it and every parameter are finite."""
+    """Gradients of the last image with respect to all earlier states and all parameters are finite."""
     state, n = simulator.encode(sample.frames).detach(), min(sample.n_steps, GRADIENT_STEPS)
     norms, of_parameters = gradient_norms(simulator, state, sample.targets, n, sample.plan)
     for step, norm in enumerate(norms):

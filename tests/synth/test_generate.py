@@ -157,7 +157,7 @@ def test_generate_keeps_finished_scenes_and_adds_more(made, tmp_path):
 
 
 def test_generate_refuses_to_mix_options(made):
-    with pytest.raises(InputError, match="made with other options"):
+    with pytest.raises(InputError, match="generated with other options"):
         generate(made[0], processes=1, progress=False, **{**SMALL, "seed": 1})
 
 
@@ -263,7 +263,7 @@ def test_generate_refuses_impossible_options(tmp_path):
         ({"world": "rigid", "engine": "genesis"}, "engine must be one of mujoco; got"),
         ({"depth": True, "far": 8.0}, "depth images reach"),
         ({"preset": "huge"}, "preset 'huge'"),
-        ({"preset": "paper"}, "paper is called diverse now"),
+        ({"preset": "paper"}, "paper is now called diverse"),
         ({"ground_albedo": 2.0}, "ground_albedo must be"),
     ]
     for changes, message in cases:

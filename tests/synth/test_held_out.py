@@ -32,7 +32,7 @@ def test_set_of_generated_scenes(tmp_path):
     found = set_of(folders)
     assert found["name"] == "validation" and found["subset"] is None and found["bodies"] == {"body 0": 2, "body 1": 2}
     assert describe_set(found) == (
-        "Validation set: 4 trajectories of elastic with seed 77, 2 a body; all of it are 24."
+        "Validation set: 4 trajectories of elastic with seed 77, 2 a body; the whole set has 24."
     )
     unseen = set_of(generated(tmp_path / "b", 3, TEST_SEED, subset="unseen"))
     assert describe_set(unseen) == "Test set: 3 trajectories of elastic (unseen) with seed 78, 1 to 2 a body."
@@ -66,4 +66,4 @@ def test_training_leaves_held_out_sets_out(tmp_path, capsys, seed):
     (tmp_path / "train.yaml").write_text("preset: tiny\n")
     command = ["train", str(tmp_path / "train.yaml"), "--data", str(tmp_path / "data"), "--out", str(tmp_path / "run")]
     assert main(command) == 2
-    assert f"(seed {seed}), which no training may see" in capsys.readouterr().err
+    assert f"(seed {seed}), which is held out" in capsys.readouterr().err

@@ -16,7 +16,6 @@ from gsim3d.testing import stability
 from gsim3d.testing.invariances import Deviation
 from gsim3d.testing.stability import (
     CHECKS,
-    Job,
     check,
     check_stability,
     describe,
@@ -33,7 +32,7 @@ FEW = ("repeat", "what is not a number")
 
 
 def job(out, *paths, **changes):
-    return Job(tuple(map(str, paths)), out, **{"n_steps": 2, "only": FEW, "progress": False, **changes})
+    return {"paths": tuple(map(str, paths)), "out": out, "n_steps": 2, "only": FEW, "quiet": True, **changes}
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +50,7 @@ def trained(tmp_path_factory, scenes):
 
 
 def test_random_model_passes_all_checks(tmp_path):
-    report = check_stability(job(tmp_path, only=()))
+    report = check_stability(**job(tmp_path, only=()))
     assert report.healthy and [finding.check for finding in report.findings] == list(CHECKS)
     assert all(finding.n_compared > 0 for finding in report.findings)
     written = json.loads((tmp_path / "report.json").read_text())
@@ -136,7 +135,7 @@ def test_failure_is_named_and_replayed(tmp_path, broken_check, scenes, capsys):
     printed = capsys.readouterr().out
     assert "FAIL repeat" in printed and "scene 1, step 4, particle 17" in printed and "ok   what is not" in printed
     file = tmp_path / "failures" / "repeat.safetensors"
-    assert f"again: gsim3d doctor --stability --replay {file}" in printed
+    assert f"reproduce: gsim3d doctor --stability --replay {file}" in printed
     assert "scene 1, step 4, particle 17" in (tmp_path / "report.md").read_text()
     found = json.loads((tmp_path / "report.json").read_text())["findings"][0]
     again = replay(file)
@@ -147,14 +146,14 @@ def test_failure_is_named_and_replayed(tmp_path, broken_check, scenes, capsys):
 def test_known_failure_of_model_card(tmp_path, broken_check, monkeypatch, trained, scenes):
     known = {"repeat": {"what": "step means", "error": 0.25, "bound": 1e-9}}
     monkeypatch.setattr(stability, "known_failures", lambda path: known)
-    report = check_stability(job(tmp_path, trained, scenes))
+    report = check_stability(**job(tmp_path, trained, scenes))
     assert [finding.outcome for finding in report.findings] == ["known failure", "holds"] and not report.healthy
     printed = describe(report)
     assert "known failure, in the model card: step means 0.25 (at most 1e-09)" in printed
     assert printed.endswith("known failures, in the model card: 1; no other check fails")
     assert "| repeat | known failure |" in (tmp_path / "report.md").read_text()
     known.clear()
-    assert check_stability(job(tmp_path, trained, scenes)).findings[0].outcome == "fails"
+    assert check_stability(**job(tmp_path, trained, scenes)).findings[0].outcome == "fails"
 
 
 def test_check_that_raises_is_a_failure(tmp_path, monkeypatch):
@@ -163,7 +162,7 @@ def test_check_that_raises_is_a_failure(tmp_path, monkeypatch):
         yield
 
     monkeypatch.setitem(CHECKS, "repeat", failing)
-    report = check_stability(job(tmp_path))
+    report = check_stability(**job(tmp_path))
     assert [finding.outcome for finding in report.findings] == ["fails", "holds"]
     failure = report.findings[0].failures[0]
     assert failure.what == "ends with RuntimeError" and failure.where == "the rollout is not finite"
@@ -185,7 +184,7 @@ def test_released_model_has_no_promised_invariances(tmp_path):
     subject = dataclasses.replace(subject, simulator=ReleasedSimulator(subject.simulator.config).eval())
     found = {f.check: f for f, _ in check(subject, random_sample(subject), 2, ["repeat", "split the batch"])}
     assert found["repeat"].outcome == "holds" and found["split the batch"].outcome == "not promised"
-    assert "repeats the behaviour of the release" in found["split the batch"].reason
+    assert "the published model does not have" in found["split the batch"].reason
 
 
 def test_sample_round_trip(tmp_path):
