@@ -250,10 +250,10 @@ def test_generate_refuses_impossible_options(tmp_path):
         ({"objects": ("cube",)}, "cube.*choose from"),
         ({"objects": ()}, "objects"),
         ({"meshes": ("absent.obj",)}, "absent.obj"),
-        ({"near": 3.0}, "the ground is seen from"),
-        ({"far": 1.0}, "far must lie beyond near"),
+        ({"near": 3.0}, "visible depths of the ground"),
+        ({"far": 1.0}, "far must be above near"),
         ({"colour": 1}, "has no option 'colour'"),
-        ({"drop_height": (3.0, 4.0)}, "none of .* draws"),
+        ({"drop_height": (3.0, 4.0)}, "all .* draws were rejected"),
         ({"processes": 0}, "processes"),
         ({"world": "lava"}, "world 'lava'"),
         ({"world": "rigid", "subset": "moon"}, "no set 'moon'.*higher"),
@@ -261,7 +261,7 @@ def test_generate_refuses_impossible_options(tmp_path):
         ({"materials": ("steel",)}, "materials must be some of"),
         ({"engine": "havok"}, "engine must be one of mujoco, genesis"),
         ({"world": "rigid", "engine": "genesis"}, "engine must be one of mujoco; got"),
-        ({"depth": True, "far": 8.0}, "depth images reach"),
+        ({"depth": True, "far": 8.0}, "far must be at most"),
         ({"preset": "huge"}, "preset 'huge'"),
         ({"preset": "paper"}, "paper is now called diverse"),
         ({"ground_albedo": 2.0}, "ground_albedo must be"),
@@ -397,7 +397,7 @@ def test_camera_spread_bounds_the_rigs(tmp_path):
 
 def test_world_refuses_ground_beyond_near_and_far():
     build_world("elastic", "mini", {"camera_spread": 0.05})
-    with pytest.raises(InputError, match="the ground is seen from"):
+    with pytest.raises(InputError, match="visible depths of the ground"):
         build_world("elastic", "mini", {"camera_spread": 0.2})
     for spread in (-0.1, 0.3, float("nan")):
         with pytest.raises(InputError, match="camera_spread must be from 0 to 0.25"):
