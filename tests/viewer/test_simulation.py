@@ -98,10 +98,8 @@ def test_switches_are_those_of_the_model_and_say_why_not(simulation):
     switches = {switch.name: switch for switch in simulation.switches()}
     history = switches["history"]
     assert list(history.settings) == ["1 step", "2 steps", "4 steps"] and history.now == "2 steps"
-    assert list(switches["sleep"].settings) == ["off", "exact"] and switches["sleep"].why.startswith("approx: ")
-    assert (
-        list(switches["opacity_changes"].settings) == ["off"] and "holds opacities" in switches["opacity_changes"].why
-    )
+    for name, settings, refused in (("sleep", ["off", "exact"], "approx"), ("opacity_changes", ["off"], "on")):
+        assert list(switches[name].settings) == settings and switches[name].why.startswith(f"{refused}: ")
     assert switches["priors"].now == "none" and "trained" in switches["priors"].why
     with pytest.raises(InputError, match="effect sleep: 'approx' is not possible; it has off, exact"):
         simulation.choose("sleep", "approx")
