@@ -26,10 +26,11 @@ class SimulationPanel:
         self._viewer, self._simulation, self._frame = viewer, simulation, -1
         self._bodies: list = []  # of the shown frame
         gui, scene = viewer.server.gui, viewer.server.scene
+        middle = tuple(simulation.target.particles[0].means.median(0).values.tolist())
         with gui.add_folder("Simulate on"):
             self._which = gui.add_dropdown("Particles", tuple(KINDS), initial_value="moving", hint=CHOOSING)
             self._inside = gui.add_checkbox("Inside of the box", False)
-            self._middle = gui.add_vector3("Middle", (0.0, 0.0, 0.0), step=0.001, visible=False)
+            self._middle = gui.add_vector3("Middle", middle, step=0.001, visible=False)
             self._sides = gui.add_vector3("Sides", (0.5, 0.5, 0.5), step=0.001, visible=False)
             self._edit = gui.add_dropdown("Edit", ("none", *OPERATIONS))
             self._vector = gui.add_vector3("By", (0.0, 0.0, 0.1), step=0.01, visible=False)
@@ -80,9 +81,9 @@ class SimulationPanel:
             raise InputError("pause at the frame that is meant first")
 
     def _choose(self) -> None:
-        self._check_paused()
         if self._which.value in KINDS:
             return
+        self._check_paused()
         rows = self._bodies[self._which.options.index(self._which.value) - len(KINDS)]
         low, high = map(np.array, self._simulation.box_of(self._frame, rows))
         self._middle.value, self._sides.value = tuple((low + high) / 2), tuple(high - low)

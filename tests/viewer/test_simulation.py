@@ -187,6 +187,7 @@ def test_a_click_chooses_a_body_or_the_background_until_another_frame_is_shown(v
         assert panel._which.value == "frozen" and not panel._inside.value
         panel._pick(types.SimpleNamespace(ray_origin=(50.0, 0.0, 50.0), ray_direction=(0.0, 0.0, 1.0)))
         assert panel._which.value == "frozen"
+        panel._which.value = panel._which.options[3]
         viewer.timeline.play()
         for act in (panel._choose, panel._simulate):
             with pytest.raises(InputError, match="pause"):
