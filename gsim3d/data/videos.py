@@ -41,6 +41,7 @@ DISTORTIONS = [(4,), (5,), (8,)]
 OWN_FOLDERS = ("masks", "labels")  # not names of cameras
 CONVERT = {"labels": as_labels, "masks": as_mask, "alpha": as_opaque}
 SAME_RATE = 5e-3  # 29.97 frames a second are called 30
+MOST_AGAIN = 100  # steps for each frame, of videos that are resampled
 MAX_DRIFT = 0.5  # frames by which videos of nearly one rate may run apart
 
 
@@ -260,9 +261,12 @@ def _resampled(
     count = math.floor((high - low) * rate + 1e-6) + 1 if high >= low else 0
     if count < 1:
         raise InputError(f"{source}: the cameras have no time in common")
-    most = recording.MAX_STEPS
+    n_frames = max(map(len, times.values()))
+    most = min(recording.MAX_STEPS, MOST_AGAIN * n_frames)
     if count > most:
-        raise InputError(f"{source}: resample gives {count} steps; more than {most} are taken to be a mistake")
+        raise InputError(
+            f"{source}: resample gives {count} steps of {n_frames} frames; more than {most} are taken to be a mistake"
+        )
     grid = low + np.arange(count) / rate
     numbers, off, again = {}, 0.0, 0
     for name, own in times.items():
