@@ -1,1 +1,1 @@
-"""What accuracy costs in time: a trained simulator under many settings, measured."""
+"""Accuracy against time: errors and step times of a trained simulator under many settings."""

@@ -419,7 +419,6 @@ class Sweep:
         limit: time budget. If it runs short, settings and rounds are skipped; every compared setting gets one round.
         progress: called with a description of each measurement.
         file: JSON file of the results, from which an interrupted sweep continues; None: results are not saved.
-        clock: clock of the device; None: a :class:`DeviceClock`.
     """
 
     def __init__(
@@ -429,10 +428,9 @@ class Sweep:
         limit: TimeLimit | None = None,
         progress: Callable[[str], None] = lambda doing: None,
         file: Path | None = None,
-        clock: DeviceClock | None = None,
     ):
         self.case, self.effort, self.limit, self.progress = case, effort, limit or TimeLimit(), progress
-        self.clock = clock or DeviceClock(case.device)
+        self.clock = DeviceClock(case.device)
         self._file, self._graphs = file, {}
         self._points = self._load() if file is not None and file.is_file() else {}
 

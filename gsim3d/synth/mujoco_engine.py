@@ -104,7 +104,8 @@ def _soft_xml(index: int, body: SoftBody, contact: str) -> tuple[str, str]:
 
 
 def _rigid_xml(index: int, body: RigidBody) -> tuple[str, str]:
-    centre = _centre(body)
+    vertices = np.concatenate(body.parts)
+    centre = (vertices.min(0) + vertices.max(0)) / 2
     # Damping ratio of the contact spring for the coefficient of restitution after half a period.
     loss = np.log(max(body.bounce, 1e-3))
     ratio = -loss / np.hypot(np.pi, loss)
@@ -127,11 +128,6 @@ def _cloth_xml(cloth: Cloth, contact: str) -> str:
       <contact selfcollide="none" {contact}/>
       <pin id="0 {n - 1} {n * (n - 1)} {n * n - 1}"/>
     </flexcomp></body>"""
-
-
-def _centre(body: RigidBody) -> np.ndarray:
-    vertices = np.concatenate(body.parts)
-    return (vertices.min(0) + vertices.max(0)) / 2
 
 
 def _flex_id(model, name: str) -> int:

@@ -80,9 +80,7 @@ def compare_sleep(
 
 
 @torch.no_grad()
-def compare_backgrounds(
-    simulator: Simulator, state: Particles, n_steps: int, cameras: Cameras, plan: Plan | None = None
-) -> BackgroundError:
+def compare_backgrounds(simulator: Simulator, state: Particles, n_steps: int, cameras: Cameras) -> BackgroundError:
     """Compares a rollout of an asymmetric model to one of a symmetric model with the same weights.
 
     Args:
@@ -90,7 +88,6 @@ def compare_backgrounds(
         state: initial state.
         n_steps: steps of the rollout.
         cameras: cameras of the compared images.
-        plan: what to compute; None: the simulator's default.
     """
     config = simulator.config
     if not config.dynamics.is_asymmetric:
@@ -98,9 +95,9 @@ def compare_backgrounds(
     dynamics = dataclasses.replace(config.dynamics, background="symmetric")
     twin = type(simulator)(dataclasses.replace(config, dynamics=dynamics)).to(state.means).eval()
     twin.load_state_dict(simulator.state_dict())
-    newest = last_steps(simulator._prepare(state, plan or simulator.plan()), 1)
+    newest = last_steps(simulator._prepare(state, simulator.plan()), 1)
     frozen = newest.activity == FROZEN
-    steps, others = (model.rollout(state, n_steps, plan) for model in (simulator, twin))
+    steps, others = (model.rollout(state, n_steps) for model in (simulator, twin))
     columns = []
     for one, other in zip(steps, others, strict=True):
         held = torch.where(frozen[:, None], newest.dynamic_latents, other.dynamic_latents)

@@ -179,12 +179,12 @@ def reordered(particles: Particles, order: Tensor) -> Particles:
     return dataclasses.replace(particles, **{name: value[order] for name, value in particles.row_fields().items()})
 
 
-def random_order(particles: Particles, seed: int = 0) -> Tensor:
+def random_order(particles: Particles) -> Tensor:
     """Random permutation of the particles of each cloud, int64 [N]; the same one for clouds of equal sizes, so that the
     particles of simulated steps still correspond."""
     table = particles.clouds
     counts = [table.count(q) for q in range(len(table))]
-    order = [torch.randperm(n, generator=torch.Generator().manual_seed(seed)) for n in counts]
+    order = [torch.randperm(n, generator=torch.Generator().manual_seed(0)) for n in counts]
     order = torch.cat([start + within for start, within in zip(table.starts[:-1], order, strict=True)])
     return order.to(particles.means.device)
 
