@@ -1,11 +1,11 @@
-"""Kinematic particles: a rollout moves the particles of actors as prescribed, and the network sees where they go.
+"""Actors: kinematic particles with prescribed displacements, which the network receives as input.
 
     pusher = Actor(displacements, of=Selection("moving", box=((-0.1, -0.1, 0.0), (0.1, 0.1, 0.2))))
     steps = simulator.rollout(state, 24, actors=[pusher])
 
-The input of the step from t to t + 1 holds an actor at its position at t, and its last displacement is the one of this
-step: older positions are shifted by the difference, and its velocity is replaced. After the step its predicted position
-is replaced, too. Appearance and opacity stay predicted.
+In the input of the step from t to t + 1, the last displacement of an actor is its displacement of this step: its older
+positions are shifted by the difference, and its velocity is replaced. After the step, its position and velocity are
+replaced, too. Appearance and opacity are predicted.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from gsim3d.state import DYNAMIC, Particles, last_steps, newest_clouds
 
 @dataclass(frozen=True)
 class Actor:
-    """Particles that move as prescribed.
+    """Particles with prescribed displacements.
 
     Attributes:
-        displacements: [T, 3] or, for each scene, [B, T, 3], metres: entry t is the displacement from step t of the
-            rollout to step t + 1. Gradients flow to it.
-        of: which particles, a Selection or its ``which``; resolved once, when the rollout begins, in each step of the
-            history.
+        displacements: displacement from step t of the rollout to step t + 1 in metres, [T, 3] or [B, T, 3] for B
+            scenes. Gradients flow to it.
+        of: selected particles, a Selection or its ``which``; resolved once at the start of the rollout, in each step of
+            the history.
     """
 
     displacements: Tensor
@@ -42,20 +42,20 @@ class Actor:
 
 
 class Actors:
-    """The actors of one rollout.
+    """The actors of a rollout.
 
     Args:
-        actors: their particles must not overlap.
-        state: last steps of every scene, from which the rollout begins.
-        n_steps: of the rollout.
+        actors: actors with disjoint particles.
+        state: initial history of the rollout.
+        n_steps: steps of the rollout.
 
     Raises:
         InputError: displacements have a wrong shape, are too few or not finite; or particles are frozen, missing or
             selected twice.
 
     Attributes:
-        state: ``state``, whose attribute ``actor`` holds the number of each particle's actor, or -1; the history of
-            actors ends with their first displacement.
+        state: initial history with the attribute ``actor``, the index of each particle's actor or -1. The last
+            displacement of actors equals their first one.
     """
 
     def __init__(self, actors: Sequence[Actor], state: Particles, n_steps: int):
@@ -81,7 +81,7 @@ class Actors:
         self.state = self._begun(dataclasses.replace(state, actor=marks))
 
     def wrap(self, predict: Callable[..., Particles]) -> Callable[..., Particles]:
-        """``predict``, a function of the history and what else the dynamics reads, with prescribed actors."""
+        """Wraps ``predict`` (history, ... -> next step), so that actors move as prescribed."""
 
         def step(history: Particles, *others, **options) -> Particles:
             newest = last_steps(history, 1)
@@ -96,14 +96,14 @@ class Actors:
         return step
 
     def _displacement(self, particles: Particles, later: int) -> Tensor:
-        """[N, 3], the displacement of each particle's actor ``later`` steps after the newest; of others: any."""
+        """Displacement [N, 3] of each particle's actor, ``later`` steps after the newest; arbitrary for others."""
         table = particles.clouds
         step = max(0, table.steps[-1] - self._first[table.scenes[-1]] + later)
         scene = self._scene_index[particles.cloud_scene[particles.row_cloud()]]
         return self._displacements[particles.actor.clamp_min(0), scene, step]
 
     def _shifted(self, history: Particles) -> Particles:
-        """``history`` whose actors' last displacement is the coming one; their newest positions stay."""
+        """Shifts older positions of actors, so that their last displacement equals the next one."""
         before, coming = self._displacement(history, -1), self._displacement(history, 0)
         newest, rows = newest_mask(history)[:, None], (history.actor >= 0)[:, None]
         fields = {"means": torch.where(rows & ~newest, history.means + before - coming, history.means)}
@@ -112,9 +112,9 @@ class Actors:
         return dataclasses.replace(history, **fields)
 
     def _begun(self, state: Particles) -> Particles:
-        """``state`` whose actors came to the newest step by their first displacement.
+        """Shifts older positions of actors, so that their last displacement equals their first one.
 
-        Particles of two encoded steps are not aligned: it is the centroid of an actor that moves so far.
+        Encoded steps have no correspondence of particles, so the displacement is that of an actor's centroid.
         """
         table, means = state.clouds, state.means.clone()
         clouds = {place: slice(*table.row_runs([q])[0]) for q, place in enumerate(zip(table.scenes, table.steps))}
@@ -124,7 +124,7 @@ class Actors:
                 now, last = clouds[scene, newest], clouds[scene, older[-1]]
                 chosen = [state.actor[cloud] == number for cloud in (now, last)]
                 if not all(bool(mask.any()) for mask in chosen):
-                    continue  # the actor is in other scenes, or was not seen before
+                    continue  # not in this scene, or not visible in the older step
                 moved = state.means[now][chosen[0]].mean(0) - state.means[last][chosen[1]].mean(0)
                 change = moved / (newest - older[-1]) - self._displacements[number, self._scene_index[scene], 0]
                 for step in older:
@@ -134,7 +134,7 @@ class Actors:
 
 
 def _checked(actor: Actor, number: int, n_scenes: int, n_steps: int) -> Tensor:
-    """[B, T, 3] displacements of an actor. Raises InputError that names its number."""
+    """Displacements of an actor [B, T, 3]. Errors name its number."""
     given, where = actor.displacements, f"actors[{number}].displacements"
     if given.dim() == 2:
         given = given.expand(n_scenes, *given.shape)

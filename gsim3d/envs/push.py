@@ -137,7 +137,7 @@ class _Push(gymnasium.Env):
         return -self._distance(self.simulation.centers[:, :2])
 
     @abstractmethod
-    def _draw(self, rng: np.random.Generator) -> tuple[list[pushing.Actor], np.ndarray, np.ndarray]:
+    def _draw(self, rng: np.random.Generator) -> tuple[list[pushing.SceneBody], np.ndarray, np.ndarray]:
         """Bodies, and positions [2] of pusher and goal."""
 
     @abstractmethod

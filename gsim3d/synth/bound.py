@@ -24,7 +24,7 @@ from gsim3d.synth import writer
 from gsim3d.synth.render import BACKGROUND, BODY
 from gsim3d.synth.run import NEEDED, check_processes, each, require_engine, require_packages
 from gsim3d.synth.scene_setup import SoftBody, Unstable
-from gsim3d.synth.world import Actor, World
+from gsim3d.synth.world import SceneBody, World
 from gsim3d.synth.worlds import WORLDS
 
 GIVEN = 4  # input steps of a model; errors are those of the last input step
@@ -184,9 +184,9 @@ def _simulated(world: World, scene: tuple[str, int], attempt: int, sample: int) 
     name = zlib.crc32(scene[0].encode())
     for redrawn in range(MAX_ATTEMPTS):
         rng = np.random.default_rng([world.seed, name, scene[1], sample, redrawn, zlib.crc32(b"bound")])
-        actors = [_with_errors(actor, errors, world.fps, rng) for actor in drawn.actors]
+        bodies = [_with_errors(body, errors, world.fps, rng) for body in drawn.bodies]
         try:
-            _, moved = world.simulate(dataclasses.replace(drawn, actors=actors))
+            _, moved = world.simulate(dataclasses.replace(drawn, bodies=bodies))
         except Unstable:
             continue
         renderer = world.renderer(rig, drawn)
@@ -194,17 +194,17 @@ def _simulated(world: World, scene: tuple[str, int], attempt: int, sample: int) 
     raise InputError(f"{scene[0]}/{scene[1]:04d}: all {MAX_ATTEMPTS} simulations with errors failed")
 
 
-def _with_errors(actor: Actor, errors: StartErrors, fps: float, rng: np.random.Generator) -> Actor:
+def _with_errors(start: SceneBody, errors: StartErrors, fps: float, rng: np.random.Generator) -> SceneBody:
     """Adds errors at time 0 whose magnitudes at the last input step are ``errors``.
 
     Bodies are in free flight until then, so the errors of velocity and spin are integrated back to time 0.
     """
-    body, before = actor.body, GIVEN - 1
+    body, before = start.body, GIVEN - 1
     velocity = errors.velocity * _direction(rng)
     spin = errors.spin * np.linalg.norm(body.spin) * _direction(rng)
     shift = errors.place * _direction(rng) - before * velocity
     turn = _rotation(errors.angle * _direction(rng) - before / fps * spin)
-    centre = (actor.vertices.min(0) + actor.vertices.max(0)) / 2
+    centre = (start.vertices.min(0) + start.vertices.max(0)) / 2
 
     def moved(points: np.ndarray) -> np.ndarray:
         return ((points - centre)[:, None] * turn).sum(-1) + centre + shift
@@ -214,7 +214,7 @@ def _with_errors(actor: Actor, errors: StartErrors, fps: float, rng: np.random.G
     else:
         moved_body = {"parts": tuple(moved(part) for part in body.parts)}
     body = dataclasses.replace(body, **moved_body, velocity=body.velocity + velocity * fps, spin=body.spin + spin)
-    return dataclasses.replace(actor, body=body, vertices=moved(actor.vertices))
+    return dataclasses.replace(start, body=body, vertices=moved(start.vertices))
 
 
 def _direction(rng: np.random.Generator) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Rigid bodies on a ground and a round pusher that moves at commanded velocities, by MuJoCo."""
+"""Simulation of rigid bodies on a ground with a kinematic spherical pusher, by MuJoCo."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from gsim3d.synth.bodies import name_rng, named_body, named_contact
 from gsim3d.synth.mujoco_engine import body_nodes, model_xml
 from gsim3d.synth.scene_setup import Pusher, RigidBody, SceneSetup, Unstable
 from gsim3d.synth.shapes import icosphere
-from gsim3d.synth.world import Actor
+from gsim3d.synth.world import SceneBody
 
-OBJECTS = ("box", "cylinder", "capsule", "spot")  # bodies that lie where they are left
-SIZE = 0.42  # metres, diameter of the sphere that holds a body
+OBJECTS = ("box", "cylinder", "capsule", "spot")  # bodies that do not roll away
+SIZE = 0.42  # diameter of the enclosing sphere of a body in metres
 DENSITY = 60.0  # kg/m^3 of the bounding box: light enough for the contacts of a kinematic pusher
 PUSHER_RADIUS, PUSHER_COLOR = 0.08, (0.85, 0.15, 0.1)
-SUBSTEP = 1 / 480  # seconds, the longest
-SETTLE = 0.5  # seconds in which bodies come to rest before an episode begins
+SUBSTEP = 1 / 480  # largest time step in seconds
+SETTLE = 0.5  # seconds that are simulated before an episode, until bodies rest
 
 
-def draw_body(name: str, position: np.ndarray, angle: float) -> Actor:
-    """A body on the ground; look, size and contacts are functions of its name.
+def draw_body(name: str, position: np.ndarray, angle: float) -> SceneBody:
+    """Returns a body on the ground, whose appearance, size and contacts depend on its name only.
 
     Args:
         name: one of ``synth.bodies.OBJECTS``.
-        position: [2] metres, of its centre.
-        angle: radians about the vertical.
+        position: horizontal position of its center [2] in metres.
+        angle: rotation about the z axis in rad.
     """
     body = named_body(name, name_rng(name))
     c, s = np.cos(angle), np.sin(angle)
@@ -43,11 +43,11 @@ def draw_body(name: str, position: np.ndarray, angle: float) -> Actor:
     parts = tuple(meshes.convex_pieces(collision, body.collision_faces))
     rigid = RigidBody(parts, np.zeros(3), np.zeros(3), mass, friction, bounce)
     facts = {"object": name, "mass": round(mass, 6), "size": SIZE, "friction": friction, "bounce": bounce}
-    return Actor(rigid, render.Surface(body.faces, body.corners, body.paint), vertices, facts)
+    return SceneBody(rigid, render.Surface(body.faces, body.corners, body.paint), vertices, facts)
 
 
 def pusher_surface() -> tuple[render.Surface, np.ndarray]:
-    """The surface of the pusher and its vertices [V, 3] around its centre, metres."""
+    """Surface of the pusher, and its vertices relative to its center [V, 3] in metres."""
     points, faces = icosphere(2)
     surface = render.Surface(faces, points[faces], lambda p: np.broadcast_to(PUSHER_COLOR, p.shape))
     return surface, PUSHER_RADIUS * points
@@ -55,29 +55,28 @@ def pusher_surface() -> tuple[render.Surface, np.ndarray]:
 
 @dataclass(frozen=True)
 class PushState:
-    """The full state of a :class:`PushSimulation`, to go back to.
+    """Full state of a :class:`PushSimulation`.
 
     Attributes:
-        values: float64, MuJoCo's integration state.
+        values: integration state of MuJoCo, float64.
     """
 
     values: np.ndarray
 
 
 class PushSimulation:
-    """Bodies that a pusher moves over the ground, one frame a step.
+    """Simulation of bodies that a kinematic pusher moves over the ground, one frame a step.
 
-    The pusher is a kinematic sphere: it moves exactly as commanded and bodies give way. Equal states and velocities
-    give equal bits.
+    Equal states and velocities give equal bits.
 
     Args:
-        bodies: at time 0, above the ground at height 0; they are left to settle for half a second.
-        pusher: its sphere at time 0.
-        fps: frames per second.
+        bodies: bodies at time 0, above the ground at height 0; SETTLE seconds are simulated before the first step.
+        pusher: pusher at time 0.
+        fps: frames a second.
 
     Raises:
         InputError: ``fps`` is not positive.
-        Unstable: the solver gives up.
+        Unstable: the solver diverges.
     """
 
     def __init__(self, bodies: Sequence[RigidBody], pusher: Pusher, fps: float):
@@ -86,7 +85,7 @@ class PushSimulation:
         os.environ.setdefault("MUJOCO_GL", "disable")
         import mujoco
 
-        mujoco.set_mju_user_warning(lambda text: None)  # it would write a file into the working directory
+        mujoco.set_mju_user_warning(lambda text: None)  # the default writes a log file to the working directory
         self._mujoco, self.fps, self.pusher_radius = mujoco, fps, pusher.radius
         self._substeps = int(np.ceil(1 / (fps * SUBSTEP) - 1e-9))
         setup = SceneSetup(tuple(bodies), 0.0, pusher=pusher)
@@ -101,27 +100,27 @@ class PushSimulation:
 
     @property
     def pusher(self) -> np.ndarray:
-        """Centre of the pusher [3], metres."""
+        """Center of the pusher [3] in metres."""
         return self._data.mocap_pos[0].copy()
 
     @property
     def centers(self) -> np.ndarray:
-        """Centres of mass of the bodies [B, 3], metres."""
+        """Centers of mass of the bodies [B, 3] in metres."""
         return self._data.xipos[self._bodies].copy()
 
     def nodes(self) -> np.ndarray:
-        """Origin and tips of the unit axes of each body [B, 4, 3], metres; see synth.embedding.RigidFrame."""
+        """Origin and tips of the unit axes of each body [B, 4, 3] in metres; see synth.embedding.RigidFrame."""
         return np.stack([body_nodes(self._data, body) for body in self._bodies])
 
     def step(self, velocity: np.ndarray) -> None:
-        """One frame, in which the pusher moves by ``velocity / fps``.
+        """Simulates one frame, in which the pusher moves by ``velocity / fps``.
 
         Args:
-            velocity: [2] m/s, horizontal.
+            velocity: horizontal velocity [2] in m/s.
 
         Raises:
             InputError: ``velocity`` is not two finite numbers.
-            Unstable: the solver gives up.
+            Unstable: the solver diverges.
         """
         velocity = np.asarray(velocity, np.float64)
         if velocity.shape != (2,) or not np.isfinite(velocity).all():
@@ -130,20 +129,20 @@ class PushSimulation:
         self._advance(np.arange(1, self._substeps + 1)[:, None] / self._substeps * moved)
 
     def state(self) -> PushState:
-        """The state now; :meth:`restore` goes back to it."""
+        """Returns the current state, for :meth:`restore`."""
         values = np.empty(self._mujoco.mj_stateSize(self._model, self._spec))
         self._mujoco.mj_getState(self._model, self._data, values, self._spec)
         return PushState(values)
 
     def restore(self, state: PushState) -> None:
-        """Goes back to ``state`` of this simulation, also after it gave up."""
+        """Restores a state of this simulation, also after it has failed."""
         for warning in self._data.warning:
             warning.number = 0
         self._mujoco.mj_setState(self._model, self._data, state.values, self._spec)
         self._mujoco.mj_forward(self._model, self._data)
 
     def _advance(self, offsets: np.ndarray) -> None:
-        """A substep for each offset [S, 3] of the pusher from where it is now."""
+        """Simulates S substeps with the offsets [S, 3] of the pusher from its current position."""
         start = self._data.mocap_pos[0].copy()
         for offset in offsets:
             self._data.mocap_pos[0] = start + offset

@@ -41,7 +41,7 @@ class Rejected(Exception):
 
 
 @dataclass(frozen=True)
-class Actor:
+class SceneBody:
     """A body of a scene.
 
     Attributes:
@@ -64,13 +64,13 @@ class SceneDraw:
     Attributes:
         ground: height of the ground in metres; None: no ground.
         cloth: cloth; None: no cloth.
-        actors: bodies.
+        bodies: bodies.
         surfaces: surfaces of the bodies, and of the cloth last.
     """
 
     ground: float | None
     cloth: Cloth | None
-    actors: list[Actor]
+    bodies: list[SceneBody]
     surfaces: list[render.Surface]
 
 
@@ -240,13 +240,13 @@ class World(ABC):
             drawn = self.draw(name, sample, attempt)
             try:
                 # Cheap check before the simulation.
-                self._check_view(rig, drawn.ground, [actor.vertices[None] for actor in drawn.actors])
+                self._check_view(rig, drawn.ground, [body.vertices[None] for body in drawn.bodies])
                 embeddings, moved = self.simulate(drawn)
                 self._check_trajectory(rig, drawn, moved)
             except (Unstable, Rejected) as reason:
                 rejected.append(str(reason))
                 continue
-            names = [f"body_{index}" for index in range(len(drawn.actors))] + ["cloth"]
+            names = [f"body_{index}" for index in range(len(drawn.bodies))] + ["cloth"]
             renderer = self.renderer(rig, drawn)
             return writer.Scene(
                 name,
@@ -258,7 +258,7 @@ class World(ABC):
                 extras={
                     **{"world": self.name, "subset": self.subset, "engine": self.engine, "seed": self.seed},
                     **{"attempt": attempt, "rejected": rejected, "ground_height": drawn.ground},
-                    "bodies": [actor.facts for actor in drawn.actors],
+                    "bodies": [body.facts for body in drawn.bodies],
                 },
                 fingerprint=self.fingerprint(name),
             )
@@ -271,11 +271,11 @@ class World(ABC):
         """Draws trajectory ``sample`` of object ``name`` at time 0; each ``attempt`` has other random numbers."""
         subset = [zlib.crc32(text.encode()) for text in (self.name, self.subset) if text not in ("elastic", TRAIN)]
         rng = np.random.default_rng([self.seed, zlib.crc32(name.encode()), sample, attempt, *subset])
-        ground, cloth, actors = self._draw(name, rng)
-        surfaces = [actor.surface for actor in actors]
+        ground, cloth, bodies = self._draw(name, rng)
+        surfaces = [body.surface for body in bodies]
         if cloth is not None:
             surfaces.append(self._cloth_surface(cloth, rng))
-        return SceneDraw(ground, cloth, actors, surfaces)
+        return SceneDraw(ground, cloth, bodies, surfaces)
 
     def renderer(self, rig: cameras.Rig, drawn: SceneDraw) -> render.Renderer:
         """Renderer of a draw with the cameras ``rig``."""
@@ -295,15 +295,15 @@ class World(ABC):
             Unstable: the solver diverges.
         """
         engine = importlib.import_module(ENGINES[self.engine])
-        setup = SceneSetup(tuple(actor.body for actor in drawn.actors), drawn.ground, drawn.cloth)
+        setup = SceneSetup(tuple(body.body for body in drawn.bodies), drawn.ground, drawn.cloth)
         embeddings = engine.simulate(setup, self.n_frames, self.fps, self.max_timestep)
-        bindings = [embedding.bind(actor.vertices) for actor, embedding in zip(drawn.actors, embeddings)]
+        bindings = [embedding.bind(body.vertices) for body, embedding in zip(drawn.bodies, embeddings)]
         if drawn.cloth is not None:
             bindings.append(embeddings[-1].refine(CLOTH_REFINEMENT))
         moved = [np.stack([b.move(nodes) for nodes in e.nodes]) for b, e in zip(bindings, embeddings, strict=True)]
         return embeddings, moved
 
-    def _draw(self, name: str, rng: np.random.Generator) -> tuple[float | None, Cloth | None, list[Actor]]:
+    def _draw(self, name: str, rng: np.random.Generator) -> tuple[float | None, Cloth | None, list[SceneBody]]:
         names = [name]
         if self.n_bodies[1] > 1:
             count = int(rng.integers(self.n_bodies[0], self.n_bodies[1] + 1))
@@ -313,12 +313,12 @@ class World(ABC):
         ground = (float(rng.uniform(low, high)) if high > low else low) if self.ground else None
         cloth = self._draw_cloth(rng)
         floor = cloth.height if cloth is not None else ground or 0.0
-        actors = []
+        bodies = []
         for body_name in names:
-            actors.append(self._draw_actor(body_name, floor, actors, rng))
-        return ground, cloth, actors
+            bodies.append(self._draw_body(body_name, floor, bodies, rng))
+        return ground, cloth, bodies
 
-    def _draw_actor(self, name: str, floor: float, before: list[Actor], rng: np.random.Generator) -> Actor:
+    def _draw_body(self, name: str, floor: float, before: list[SceneBody], rng: np.random.Generator) -> SceneBody:
         path = next((path for path in self.meshes if mesh_name(path) == name), None)
         if path is None:
             body = named_body(name, name_rng(name) if self.by_name else rng)
@@ -344,7 +344,7 @@ class World(ABC):
         simulated, facts = self._make_body(name, collision + position, body.collision_faces, velocity, spin, rng)
         facts = {"object": name, "mass": round(simulated.mass, 6), "size": round(size, 6), **facts}
         surface = render.Surface(body.faces, body.corners, self._painted(body.paint, facts))
-        return Actor(simulated, surface, vertices + position, facts)
+        return SceneBody(simulated, surface, vertices + position, facts)
 
     def _flight(self, drop: float, lift: float) -> float:
         """Seconds until a body reaches its target position."""
@@ -377,13 +377,13 @@ class World(ABC):
 
     def _check_trajectory(self, rig: cameras.Rig, drawn: SceneDraw, moved: list[np.ndarray]) -> None:
         """Raises Unstable or Rejected for the vertices ``moved`` [T, V, 3] of all surfaces."""
-        bodies = moved[: len(drawn.actors)]
+        bodies = moved[: len(drawn.bodies)]
         for vertices in bodies:
             scene_setup.check_motion(vertices, drawn.ground)
         self._check_view(rig, drawn.ground, bodies)
         centres = np.stack([vertices.mean(1) for vertices in bodies])
-        masses = np.array([actor.body.mass for actor in drawn.actors])
-        spins = [((actor.body.spin**2).sum() * (actor.facts["size"] / 2) ** 2) / 2 for actor in drawn.actors]
+        masses = np.array([body.body.mass for body in drawn.bodies])
+        spins = [((body.body.spin**2).sum() * (body.facts["size"] / 2) ** 2) / 2 for body in drawn.bodies]
         scene_setup.check_energy(centres, masses, max(spins), self.fps)
         if drawn.cloth is not None:
             n = (drawn.cloth.count - 1) * CLOTH_REFINEMENT + 1
@@ -400,12 +400,12 @@ class World(ABC):
                 raise Rejected("a body leaves the ground")
 
 
-def _clear_of(position: np.ndarray, radius: float, before: list[Actor]) -> np.ndarray:
+def _clear_of(position: np.ndarray, radius: float, before: list[SceneBody]) -> np.ndarray:
     """Raises ``position`` until the bounding sphere of the body touches no other."""
     position = position.copy()
-    for actor in sorted(before, key=lambda actor: actor.vertices[:, 2].mean()):
-        centre = (actor.vertices.min(0) + actor.vertices.max(0)) / 2
-        reach = radius + actor.facts["size"] / 2 + GAP
+    for other in sorted(before, key=lambda other: other.vertices[:, 2].mean()):
+        centre = (other.vertices.min(0) + other.vertices.max(0)) / 2
+        reach = radius + other.facts["size"] / 2 + GAP
         aside = ((position[:2] - centre[:2]) ** 2).sum()
         if aside < reach**2 and abs(position[2] - centre[2]) ** 2 + aside < reach**2:
             position[2] = centre[2] + np.sqrt(reach**2 - aside)

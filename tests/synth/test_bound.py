@@ -40,9 +40,9 @@ def test_start_errors_have_their_lengths_at_the_last_given_step(world):
     settings = build_world(world, "published", {**SMALL, "drop_height": (0.9, 0.9), "fps": 42.0})
     drawn, errors = settings.draw("box", 0, 0), ERRORS[world]
     rng = np.random.default_rng(0)
-    actor = module._with_errors(drawn.actors[0], errors, settings.fps, rng)
+    body = module._with_errors(drawn.bodies[0], errors, settings.fps, rng)
     _, (true, *_) = settings.simulate(drawn)
-    _, (moved, *_) = settings.simulate(dataclasses.replace(drawn, actors=[actor]))
+    _, (moved, *_) = settings.simulate(dataclasses.replace(drawn, bodies=[body]))
     shift = (moved - true).mean(1)
     last = GIVEN - 1
     np.testing.assert_allclose(np.linalg.norm(shift[last]), errors.place, atol=3e-5)
@@ -54,7 +54,7 @@ def test_start_errors_have_their_lengths_at_the_last_given_step(world):
         return np.arccos((np.trace(u @ v) - 1) / 2)
 
     assert abs(turned(last) - errors.angle) < 1e-3
-    spin = np.linalg.norm(drawn.actors[0].body.spin)
+    spin = np.linalg.norm(drawn.bodies[0].body.spin)
     assert (spin > 0.1) == (world == "rigid")
     if world == "rigid":
         np.testing.assert_allclose(turned(6), errors.spin * spin * (6 - last) / settings.fps, rtol=0.2, atol=3e-5)

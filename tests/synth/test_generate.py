@@ -341,7 +341,7 @@ def test_published_bodies_are_functions_of_their_names(world):
     looks = set()
     for name in settings.object_names():
         drawn = [settings._draw(name, np.random.default_rng(seed)) for seed in range(2)]
-        (first,), (second,) = (actors for _, _, actors in drawn)
+        (first,), (second,) = (bodies for _, _, bodies in drawn)
         assert first.facts == {**second.facts, "mass": first.facts["mass"]} and len(drawn[0][2]) == 1
         assert not np.array_equal(first.vertices, second.vertices)
         sampled = points[:, : first.surface.corners.shape[2]]

@@ -152,7 +152,7 @@ def test_genesis_meshes_are_found_without_import(tmp_path, monkeypatch):
         bodies.load_mesh("genesis:broken")
     settings = build_world("elastic", "published", {"meshes": ("genesis:worm",)})
     assert settings.object_names()[-1] == "worm" and settings.fingerprint("worm") != settings.fingerprint("spot")
-    assert settings.draw("worm", 0, 0).actors[0].facts["object"] == "worm"
+    assert settings.draw("worm", 0, 0).bodies[0].facts["object"] == "worm"
     assert "genesis" not in sys.modules
 
 
