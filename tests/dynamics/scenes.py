@@ -45,7 +45,7 @@ def make_dynamics(config=TINY, seed=0, dtype=torch.float32):
 
 
 def make_history(n_rows=(40, 30), seed=0, config=TINY, frozen_share=0.25, dtype=torch.float32):
-    """One scene with n_rows[t] rows at step t, inside a box of 0.5 m."""
+    """One scene with n_rows[t] particles at step t, in a box of 0.5 m."""
     g = torch.Generator().manual_seed(seed)
     n, n_steps = sum(n_rows), len(n_rows)
 
@@ -75,7 +75,7 @@ def make_history(n_rows=(40, 30), seed=0, config=TINY, frozen_share=0.25, dtype=
 
 
 def batch(histories):
-    """Several scenes packed into one."""
+    """Packs several scenes into a batch."""
     names = (*Particles.ROW_FIELDS, "cloud_step", "origin")
     names = [name for name in names if getattr(histories[0], name) is not None]
     fields = {name: torch.cat([getattr(h, name) for h in histories]) for name in names}
@@ -86,7 +86,7 @@ def batch(histories):
 
 
 def permute_rows(history, seed=0):
-    """Rows of each cloud in another order, and where each new row came from."""
+    """Permutes the particles of each cloud. Also returns the permutation."""
     g = torch.Generator().manual_seed(seed)
     pairs = zip(history.cu_rows[:-1].tolist(), history.cu_rows[1:].tolist(), strict=True)
     order = torch.cat([a + torch.randperm(b - a, generator=g) for a, b in pairs])
@@ -100,6 +100,6 @@ def float_fields(particles):
 
 
 def advance(layout, particles, prediction, awake=None):
-    """The steps that a ``prediction`` [N, channels] of a network without priors makes of ``particles``."""
+    """Steps of ``particles`` for a ``prediction`` [N, channels] of a network without priors."""
     outputs, _ = layout.split(prediction, layout.changes())
     return layout.advance(particles, outputs, layout.displacements(particles, outputs), awake)

@@ -1,4 +1,4 @@
-"""The dynamics on pyramids of given sizes: the same numbers, whatever room there is."""
+"""The dynamics on pyramids with a capacity: results do not depend on it."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ SIZES = [[(40, 30)], [(1,)], [(0, 12)], [(12, 0)], [(40, 30), (3,), (5, 6, 7), (
 
 
 def some_asleep(history):
-    """Rows at no finite place, outside the grid, and asleep by their activity."""
+    """Particles with invalid positions, outside the grid, and asleep."""
     means, activity = history.means.clone(), history.activity.clone()
     means[::7], means[3::11], activity[5::13] = torch.nan, -1.0, ASLEEP
     return dataclasses.replace(history, means=means, activity=activity)
@@ -43,7 +43,7 @@ def test_capacity_changes_no_bit(factor, sizes, config, asleep):
         assert_same_bits(getattr(step, name), value, name)
 
 
-def test_a_pyramid_made_before_changes_no_bit():
+def test_given_pyramid_changes_no_bit():
     dynamics, history = make_dynamics(), some_asleep(make_history((40, 30)))
     assert_same_bits(dynamics(history, pyramid=dynamics.geometry(history)).means, dynamics(history).means)
 
@@ -124,7 +124,7 @@ def test_batch_norm_refuses_padding():
 
 
 @pytest.mark.parametrize("asleep", [False, True])
-def test_devices_agree_on_given_sizes(asleep, devices):
+def test_capacity_on_cuda_matches_cpu(asleep, devices):
     dynamics = make_dynamics(TINY, dtype=torch.float64)
     history = batch(
         [make_history((40, 30), dtype=torch.float64), make_history((300, 200, 100), 1, dtype=torch.float64)]
@@ -139,7 +139,7 @@ def test_devices_agree_on_given_sizes(asleep, devices):
         assert_close_relative_to_max(getattr(step, name).cpu()[finite], value[finite], 1e-11, name)
 
 
-def test_a_graph_predicts_from_other_particles(devices):
+def test_captured_step_with_other_particles(devices):
     dynamics = make_dynamics(TINY).to(devices[1])
     history = make_history((400, 300)).to(devices[1])
     history = history.with_clouds(history.clouds)

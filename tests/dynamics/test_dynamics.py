@@ -1,4 +1,4 @@
-"""One step of the dynamics: any history, ragged scenes, laws of symmetry, determinism."""
+"""One step of the dynamics: histories, ragged batches, symmetries and determinism."""
 
 import dataclasses
 
@@ -33,12 +33,12 @@ def test_any_history(n_rows, config):
     assert not torch.equal(step.means[moves], newest.means[moves])
 
 
-def test_an_empty_newest_step_stays_empty():
+def test_empty_newest_step_stays_empty():
     step = make_dynamics()(make_history((12, 0)))
     assert step.n_rows == 0 and step.cloud_step.tolist() == [2]
 
 
-def test_an_untrained_preset_predicts_that_nothing_changes():
+def test_untrained_preset_predicts_no_change():
     config = dataclasses.replace(EXPLICIT, zero_init=True)
     history = make_history((20, 30), config=config)
     step, newest = make_dynamics(config)(history), last_steps(history, 1)
@@ -50,7 +50,7 @@ def test_an_untrained_preset_predicts_that_nothing_changes():
 
 @pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize("config", [TINY, EXPLICIT, MOVING])
-def test_scenes_do_not_change_each_other(config):
+def test_scenes_are_independent(config):
     dynamics = make_dynamics(config)
     sizes = [(40, 30), (3,), (5, 6, 7), (60, 0, 1, 2)]
     histories = [make_history(n_rows, seed=i, config=config) for i, n_rows in enumerate(sizes)]
@@ -60,7 +60,7 @@ def test_scenes_do_not_change_each_other(config):
 
 
 @pytest.mark.parametrize("config", [TINY, EXPLICIT, MOVING])
-def test_frozen_particles_hold_still(config):
+def test_frozen_particles_do_not_move(config):
     history = make_history((30, 40), config=config)
     step, newest = make_dynamics(config)(history), last_steps(history, 1)
     frozen = newest.activity == FROZEN
@@ -71,14 +71,14 @@ def test_frozen_particles_hold_still(config):
     assert not torch.equal(step.dynamic_latents[frozen], newest.dynamic_latents[frozen])
 
 
-def test_frozen_particles_take_no_gradient_into_the_prediction():
+def test_frozen_particles_have_no_prediction_gradient():
     dynamics, history = make_dynamics(), make_history((30,), frozen_share=2.0)
     dynamics(history).means.sum().backward()
     assert all(p.grad is None or not p.grad.any() for p in dynamics.parameters())
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -1.0, 1e6])
-def test_particles_outside_grid_sleep_unseen(bad):
+def test_particles_outside_grid_sleep(bad):
     dynamics, history = make_dynamics(), make_history((25, 30))
     odd = torch.zeros(history.n_rows, dtype=torch.bool)
     odd[[3, 30, 54]] = True
@@ -93,7 +93,7 @@ def test_particles_outside_grid_sleep_unseen(bad):
         assert_same_bits(getattr(step, name)[~asleep], value, name)
 
 
-def test_whole_cells_of_translation_change_nothing_but_positions():
+def test_translation_by_whole_cells():
     dynamics, history = make_dynamics(), make_history((30, 30))
     history = dataclasses.replace(history, means=(history.means * 2**16).round() / 2**16)  # adds without rounding
     shift = torch.tensor([16.0, -32.0, 48.0]) * TINY.grid_size
@@ -114,7 +114,7 @@ def test_motion_depends_on_position_with_position_features_only(position_feature
     assert (change > 1e-3) == position_features
 
 
-def test_the_order_of_rows_permutes_the_result():
+def test_permutation_of_particles():
     dynamics, history = make_dynamics(), make_history((40, 40))
     permuted, order = permute_rows(history)
     step, permuted_step = dynamics(history), dynamics(permuted)
@@ -123,7 +123,7 @@ def test_the_order_of_rows_permutes_the_result():
     assert_close_relative_to_max(permuted_step.dynamic_latents, step.dynamic_latents[rows], "dynamics_order")
 
 
-def test_time_is_counted_from_the_newest_step():
+def test_time_slots_count_from_newest_step():
     dynamics, history = make_dynamics(), make_history((30, 20))
     later = dataclasses.replace(history, cloud_step=history.cloud_step + 5)
     assert_same_bits(dynamics(later).means, dynamics(history).means)
@@ -132,7 +132,7 @@ def test_time_is_counted_from_the_newest_step():
     assert not torch.equal(dynamics(gap).means, dynamics(history).means)
 
 
-def test_same_bits_on_one_thread_and_two_forward_and_backward():
+def test_bits_are_independent_of_threads():
     dynamics, history = make_dynamics(), make_history((300, 300))
 
     def run():
@@ -146,7 +146,7 @@ def test_same_bits_on_one_thread_and_two_forward_and_backward():
 
 
 @pytest.mark.parametrize("norm", ["layer", "batch"])
-def test_checkpointing_gives_equal_gradients_to_every_parameter(norm):
+def test_checkpointing_keeps_gradients(norm):
     config = dataclasses.replace(TINY, norm=norm, drop_path=0.3, shuffle_orders=True)
     history = make_history((40, 40))
     grads = []
@@ -161,7 +161,7 @@ def test_checkpointing_gives_equal_gradients_to_every_parameter(norm):
         assert_same_bits(with_checkpoints, without)
 
 
-def test_randomness_comes_from_the_generator_and_in_training_only():
+def test_generator_is_the_only_randomness():
     config = dataclasses.replace(TINY, drop_path=0.5, shuffle_orders=True)
     dynamics, history = make_dynamics(config), make_history((40, 40))
 
@@ -184,7 +184,7 @@ def test_drop_path_rates_grow_from_zero():
     assert decoder[0] == pytest.approx([0.15, 0.0]) and decoder[1] == pytest.approx([0.3])
 
 
-def test_batch_norm_uses_running_statistics_in_evaluation_and_survives_one_row():
+def test_batch_norm_in_evaluation_and_with_one_row():
     dynamics = make_dynamics(dataclasses.replace(TINY, norm="batch"))
     histories = [make_history((40,), seed=0), make_history((30,), seed=1)]
     alone = dynamics(histories[0])
@@ -197,8 +197,8 @@ def test_batch_norm_uses_running_statistics_in_evaluation_and_survives_one_row()
 
 @pytest.mark.parametrize("norm", ["layer", "batch"])
 @pytest.mark.parametrize("sleeper", [False, True])
-def test_rows_that_are_none_change_nothing_in_training(norm, sleeper, device):
-    """Where the geometry is rounded the network sees more rows; they reach no statistics and no gradient."""
+def test_padding_rows_change_nothing_in_training(norm, sleeper, device):
+    """Rounded geometry adds padding rows, which change neither statistics nor gradients."""
     dynamics, results = make_dynamics(dataclasses.replace(TINY, norm=norm)).train().double().to(device), []
     history = make_history((97, 113)).to(device)
     reals = {k: v.double() for k, v in history.row_fields().items() if v.is_floating_point()}
@@ -221,7 +221,7 @@ def test_rows_that_are_none_change_nothing_in_training(norm, sleeper, device):
         assert (rounded - exact).abs().max() <= 1e-12 * max(1, largest)
 
 
-def test_rollout_feeds_steps_back_and_carries_gradients_to_the_start():
+def test_rollout_is_autoregressive_and_differentiable():
     dynamics, history = make_dynamics(), make_history((20, 25))
     means = history.means.clone().requires_grad_()
     steps = rollout(dynamics, dataclasses.replace(history, means=means), 3, 2)
@@ -233,7 +233,7 @@ def test_rollout_feeds_steps_back_and_carries_gradients_to_the_start():
 
 
 @pytest.mark.parametrize("predicts", ["from_newest", "from_previous", "absolute"])
-def test_several_steps_a_call(predicts):
+def test_several_steps_per_call(predicts):
     config = dataclasses.replace(TINY, steps_per_call=3, predicts=predicts)
     dynamics = make_dynamics(config)
     both = batch([make_history((20, 25)), make_history((9,), seed=1)])
@@ -251,7 +251,7 @@ def test_several_steps_a_call(predicts):
     assert_same_particles(steps[3], again.select_clouds(torch.tensor([0, 3])))
 
 
-def test_append_step_keeps_the_last_steps_of_each_scene():
+def test_append_step_keeps_last_steps():
     both = batch([make_history((5, 6)), make_history((3,), seed=1)])
     step = make_dynamics()(both)
     state = append_step(both, step, 2)
@@ -260,7 +260,7 @@ def test_append_step_keeps_the_last_steps_of_each_scene():
     assert_same_bits(state.means[6:12], step.means[:6])
 
 
-def test_a_long_rollout_stays_finite():
+def test_long_rollout_is_finite():
     dynamics, history = make_dynamics(), make_history((30, 30))
     with torch.no_grad():
         final = rollout(dynamics, history, 200, 2)[-1]
@@ -296,6 +296,6 @@ def test_config_errors(change, message):
 
 
 @pytest.mark.parametrize("config", [TINY, EXPLICIT, MOVING])
-def test_a_history_without_any_particle_stays_empty(config):
+def test_history_without_particles_stays_empty(config):
     step = make_dynamics(config)(make_history((0, 0), config=config))
     assert step.n_rows == 0 and step.cloud_step.tolist() == [2]

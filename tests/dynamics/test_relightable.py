@@ -1,4 +1,4 @@
-"""A relightable background: seen as it was when the simulation began, so that errors do not add up."""
+"""Relightable background: the network reads its initial latents, so that errors do not accumulate."""
 
 import dataclasses
 
@@ -24,7 +24,7 @@ def with_latents(particles, rows, latents):
     )
 
 
-def test_the_network_sees_the_background_in_the_newest_step_only():
+def test_network_reads_background_of_newest_step_only():
     dynamics, history = make_dynamics(RELIGHTABLE), make_history((40, 40, 30))
     older = frozen_rows(history) & (history.row_cloud() < 2)
     assert older.any()
@@ -39,7 +39,7 @@ def test_the_network_sees_the_background_in_the_newest_step_only():
     assert not torch.equal(symmetric(other).means, symmetric(history).means)
 
 
-def test_what_was_predicted_of_the_background_is_not_seen_again():
+def test_network_reads_initial_latents_of_background():
     dynamics, history = make_dynamics(RELIGHTABLE), make_history((30, 30))
     history = with_attribute(history, "initial_latents")
     frozen = frozen_rows(history)
@@ -54,8 +54,8 @@ def test_what_was_predicted_of_the_background_is_not_seen_again():
 
 
 @pytest.mark.parametrize("features, is_seen", [("all", False), ("dynamic", False), ("frozen", True), ("none", True)])
-def test_what_was_predicted_of_bodies_is_not_seen_again_where_their_look_changes(features, is_seen):
-    """Else it is what they were given, or were made to be."""
+def test_network_reads_initial_latents_of_changing_bodies(features, is_seen):
+    """With constant latents, the network reads the current ones."""
     dynamics, history = make_dynamics(RELIGHTABLE), with_attribute(make_history((30, 30)), "initial_latents")
     bodies = history.activity == DYNAMIC
     dark = with_latents(history, bodies, torch.full_like(history.dynamic_latents, -3.0))
@@ -64,8 +64,8 @@ def test_what_was_predicted_of_bodies_is_not_seen_again_where_their_look_changes
     assert torch.equal(step.means, before.means) != is_seen
 
 
-def test_a_background_in_front_of_which_nothing_changes_does_not_change():
-    """Else the same prediction would be added in every step."""
+def test_predicted_changes_do_not_accumulate():
+    """The same prediction is not added again in every step."""
     dynamics, history = make_dynamics(RELIGHTABLE), make_history((30, 30, 30, 30))
     still = {name: value[:30].repeat(4, *[1] * (value.dim() - 1)) for name, value in history.row_fields().items()}
     history = history.with_clouds(history.clouds, **still)
@@ -87,7 +87,7 @@ def test_a_background_in_front_of_which_nothing_changes_does_not_change():
         assert_same_bits(step.dynamic_latents, first.dynamic_latents)
 
 
-def test_a_rollout_goes_on_from_its_own_steps():
+def test_rollout_continues_from_its_steps():
     dynamics = make_dynamics(RELIGHTABLE)
     history = batch([make_history((30, 20)), make_history((10, 25), 1)])
     whole = rollout(dynamics, history, 5, 4)
@@ -100,7 +100,7 @@ def test_a_rollout_goes_on_from_its_own_steps():
     assert_same_bits(last_steps(one_by_one, 1).dynamic_latents, whole[-1].dynamic_latents)
 
 
-def test_scenes_do_not_change_each_other():
+def test_scenes_are_independent():
     dynamics = make_dynamics(RELIGHTABLE)
     histories = [make_history((30, 20), 1), make_history((15, 25), 2)]
     together = dynamics(batch(histories))
@@ -109,7 +109,7 @@ def test_scenes_do_not_change_each_other():
     assert_same_bits(together.means, torch.cat([step.means for step in alone]))
 
 
-def test_gradients_flow_to_how_the_background_began():
+def test_gradients_flow_to_initial_latents():
     dynamics, history = make_dynamics(RELIGHTABLE), make_history((30, 30))
     latents = history.dynamic_latents.requires_grad_()
     steps = rollout(dynamics, history, 3, 4)
@@ -119,6 +119,6 @@ def test_gradients_flow_to_how_the_background_began():
     assert gradient[frozen & ~newest].eq(0).all()
 
 
-def test_explicit_models_have_no_such_background():
+def test_explicit_models_are_refused():
     with pytest.raises(ValueError, match='background="relightable" does not support explicit models'):
         dataclasses.replace(EXPLICIT, background="relightable")

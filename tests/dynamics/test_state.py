@@ -1,4 +1,4 @@
-"""Layout of the state and the rules that update it."""
+"""Layout of the network's channels and update of the state."""
 
 import dataclasses
 
@@ -44,7 +44,7 @@ def test_position_features_are_relative_to_origin_and_cell():
     assert features.tolist() == [[0.125, 0.5, 1.1875, 0.0, -1.0, 0.5]]
 
 
-def test_increments():
+def test_predicted_increments_are_bounded():
     particles = make_history((20,), config=EXPLICIT)
     layout = StateLayout.of(EXPLICIT)
     prediction = 50 * torch.randn(20, layout.out_channels, generator=torch.Generator().manual_seed(0))
@@ -58,7 +58,7 @@ def test_increments():
     assert not torch.equal(after.quats[moves], particles.quats[moves])
 
 
-def test_no_limit_adds_the_prediction_itself():
+def test_unlimited_increments():
     x = torch.tensor([-5.0, 0.1])
     assert bounded(x, None) is x
     assert_same_bits(bounded(x, 2.0), 2 * torch.tanh(x))
@@ -69,7 +69,7 @@ def random_prediction(layout, n, scale=0.3):
 
 
 @pytest.mark.parametrize("predicts", ["from_newest", "from_previous", "absolute"])
-def test_the_first_step_of_a_call_is_the_step_of_a_call_of_one(predicts):
+def test_first_step_of_call_matches_single_step(predicts):
     config = dataclasses.replace(EXPLICIT, predicts=predicts)
     particles = make_history((20,), config=config)
     one, three = StateLayout.of(config), StateLayout.of(dataclasses.replace(config, steps_per_call=3))
@@ -86,7 +86,7 @@ def test_the_first_step_of_a_call_is_the_step_of_a_call_of_one(predicts):
         assert not torch.equal(step.sh[frozen], particles.sh[frozen])
 
 
-def test_differences_from_the_step_before_add_up():
+def test_increments_from_previous_step_accumulate():
     config = dataclasses.replace(EXPLICIT, predicts="from_previous", steps_per_call=2)
     newest_only = dataclasses.replace(config, predicts="from_newest", steps_per_call=1)
     particles = make_history((20,), config=config, frozen_share=0.0)
@@ -99,7 +99,7 @@ def test_differences_from_the_step_before_add_up():
         assert_close_relative_to_max(getattr(second, name), value, 1e-6, name)
 
 
-def test_absolute_predictions_are_the_state():
+def test_absolute_predictions():
     config = ReleasedDynamicsConfig(**{**vars(EXPLICIT), "predicts": "absolute"})
     layout = StateLayout.of(config)
     assert dict(layout.outputs)["quats"] == 4
@@ -115,7 +115,7 @@ def test_absolute_predictions_are_the_state():
 
 
 @pytest.mark.parametrize("predicts", ["from_newest", "from_previous", "absolute"])
-def test_rows_asleep_keep_every_bit(predicts):
+def test_sleeping_particles_keep_their_bits(predicts):
     config = dataclasses.replace(EXPLICIT, predicts=predicts, steps_per_call=2)
     layout = StateLayout.of(config)
     particles = make_history((20,), config=config)
@@ -127,7 +127,7 @@ def test_rows_asleep_keep_every_bit(predicts):
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 9e-5, 1.1e-4, 1.0, 3.0, 7.0])
-def test_rotations_turn_about_world_axes(angle):
+def test_rotation_vectors_use_world_axes(angle):
     g = torch.Generator().manual_seed(0)
     quats = torch.randn(10, 4, generator=g, dtype=torch.float64)
     axes = torch.nn.functional.normalize(torch.randn(10, 3, generator=g, dtype=torch.float64), dim=1)
@@ -140,7 +140,7 @@ def test_rotations_turn_about_world_axes(angle):
     assert (turned.gather(1, turned.abs().argmax(1, keepdim=True)) > 0).all()
 
 
-def test_gradients_of_rotations_also_at_zero():
+def test_rotation_gradients_at_zero():
     g = torch.Generator().manual_seed(1)
     quats = torch.randn(4, 4, generator=g, dtype=torch.float64, requires_grad=True)
     vectors = torch.randn(4, 3, generator=g, dtype=torch.float64)

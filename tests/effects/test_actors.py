@@ -1,4 +1,4 @@
-"""Actors: particles that a rollout moves as prescribed, and which the network sees move."""
+"""Actors: particles with prescribed displacements in rollouts."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""What is given up is measured: errors of sleep, of an asymmetric background, and of the shadows that it loses."""
+"""Approximation errors of sleep and of an asymmetric background, including lost shadows."""
 
 import math
 

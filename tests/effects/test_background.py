@@ -1,4 +1,4 @@
-"""The background of an asymmetric model: what moving rows read of it, and that it is computed once."""
+"""Asymmetric background: contributions to moving particles, and caching."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Edits: what an operation does to a state, that a rollout goes on from it, and errors that name step and operation."""
+"""Edits: operations on states, edits within rollouts, and error messages."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""What rests is not computed: counted, a step takes less the more of a scene is at rest; times are benchmarks."""
+"""Costs of effects: counts of computed particles fall with the share at rest (times: see the benchmarks)."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""A spec comes back as it was from JSON and YAML, and its hash is in checkpoints, exports and reports."""
+"""Specs: round trip through JSON and YAML, and hashes in checkpoints, exports and reports."""
 
 import dataclasses
 import itertools

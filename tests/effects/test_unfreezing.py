@@ -1,4 +1,4 @@
-"""Training shows some of the background as movable, at random and by cubes."""
+"""Background unfreezing: training marks random cubes of the background as movable."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""The background stops what would get behind it; what the rows of a body do to each other does not move it as one."""
+"""Contact response: non-penetration, friction, and conservation of momentum by internal displacements."""
 
 import dataclasses
 
@@ -43,7 +43,7 @@ def solver(history, radius=WIDE, friction=FRICTION, skin=SKIN, rigid=False):
 
 
 def moves(history, onward=0.0, motions=0.0, back=0.0, **options):
-    """[N, 3], of what is given for rows that move; for all of them alike where it is a vector."""
+    """[N, 3]: the given values at movable particles (a vector: equal for all), 0 elsewhere."""
     moving = (history.activity == DYNAMIC)[:, None]
     rows = [torch.where(moving, torch.as_tensor(x).to(history.means), 0) for x in (onward, motions, back)]
     return solver(history, **options).displacements(*(x.expand(history.n_rows, 3) for x in rows))
@@ -59,7 +59,7 @@ def moving_places(history):
 
 
 def weights(history, moving):
-    """How much surface each row that moves stands for, as windows count it."""
+    """Weight of each movable particle in the windows."""
     return windows(history, WIDE, CELL, evenly=True).weights[0, 0, : int(moving.sum()), None]
 
 
@@ -96,7 +96,7 @@ def test_gained_displacement_counts_once():
 
 
 def two_balls():
-    """One on the ground and one 16 cm away from it, which know their bodies; bool [N], rows of the first."""
+    """Two segmented bodies, one on the ground and one 16 cm from it, and the mask bool [N] of the first."""
     one, other = ball(0.0), ball(0.25, n=300, seed=1)
     moves = other.activity == DYNAMIC
     other = dataclasses.replace(other, means=other.means + torch.tensor([0.5, 0.0, 0.0])).select_rows(moves)
@@ -107,7 +107,7 @@ def two_balls():
 
 
 def test_contact_of_one_body_leaves_neighboring_body():
-    """What a window about as large as a body would not do: what stops one slows the other, too."""
+    """Windows without segmentation would slow the other body, too."""
     history, first = two_balls()
     second = (history.activity == DYNAMIC) & ~first
     pushed = torch.where(first[:, None], torch.tensor([0.02, 0.0, 0.03]), 0)
@@ -131,7 +131,7 @@ def test_segmented_windows_conserve_momentum(which):
 
 
 def test_rigid_contact_stops_whole_body():
-    """Of a ball that falls by 8 cm and comes from 2 cm above most rows fall on, if it is not solid."""
+    """A ball falls by 8 cm from a height of 2 cm; without ``rigid``, most particles would continue."""
     history = ball(0.02)
     history = dataclasses.replace(history, body=bodies(history))
     moving, places = moving_places(history)
@@ -145,7 +145,7 @@ def test_rigid_contact_stops_whole_body():
 
 @pytest.mark.parametrize("solid", [False, True])
 def test_faint_particles_stop_no_rigid_body(solid):
-    """Of a ball high above the ground one row is below it."""
+    """One particle of a ball high above the ground is below the ground."""
     history = ball(0.2)
     moving = history.activity == DYNAMIC
     lowest = moving.nonzero()[history.means[moving, 2].argmin()]
@@ -179,7 +179,7 @@ def test_rigid_contact_at_one_end_turns_body():
 
 @pytest.mark.parametrize("skin", [0.0, 0.02])
 def test_contact_stops_particles_at_offset(skin):
-    """A ball that falls by 8 cm and comes from 2 cm above."""
+    """A ball falls by 8 cm from a height of 2 cm."""
     history = ball(0.02)
     moving, _ = moving_places(history)
     found = moves(history, onward=[0.03, 0.0, -0.08], skin=torch.tensor(skin))[moving]
@@ -270,7 +270,7 @@ def test_stopped_height_has_no_gradient_to_position():
 
 @pytest.mark.parametrize("share", ["own motion", "way back"])
 def test_gain_gradient_matches_finite_difference(share):
-    """Of how high a ball is that was squeezed and jumps: a row that went back is nearer to its place from then on."""
+    """Objective: height of a compressed ball that bounces."""
     history = ball(0.1, (0.02, 0.0, -0.06), (0.03, 0.06, 0.0))
     dynamics = make_dynamics(PUSHED)
     name, begin = {"own motion": ("inertia", 6), "way back": ("shape_matching", 0)}[share]
@@ -329,7 +329,7 @@ def test_contact_parameters_have_gradients():
         assert parameter.grad.isfinite().all() and parameter.grad.abs().sum() > 0
 
 
-def test_where_nothing_is_nothing_happens():
+def test_contact_of_empty_scene():
     history = ball(0.02)
     empty = history.select_rows(torch.zeros(history.n_rows, dtype=torch.bool))
     assert make_dynamics(PUSHED)(empty).means.shape == (0, 3)
@@ -376,7 +376,7 @@ def test_contact_needs_other_priors(name):
 
 
 def test_even_windows_weigh_particles_by_surface():
-    """Of the lower half of a ball one row in five is seen."""
+    """Only one in five particles of the lower half of a ball is present."""
     history = ball(1.0, n=800)
     moving, _ = moving_places(history)
     height = history.means[:, 2] - 2.0 - RADIUS

@@ -1,4 +1,4 @@
-"""Matter in flight flies on, turns and falls, whatever is predicted; what touches something does what is predicted."""
+"""Gravity: ballistic flight for any prediction, and full predictions in contact."""
 
 import dataclasses
 
@@ -30,7 +30,7 @@ FLYING = with_priors(
 
 
 def ball(height, velocity=(0.0, 0.0, 0.0), spin=(0.0, 0.0, 0.0), n=300, ground=True, seed=0):
-    """A ball of 20 cm whose lowest point is so high over a ground of frozen rows, 4 cm apart; metres and steps."""
+    """A ball of 20 cm with its lowest point at ``height`` over frozen particles 4 cm apart."""
     g = torch.Generator().manual_seed(seed)
     places = RADIUS * torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=1)
     ticks = (torch.arange(40) - 20) * 0.04

@@ -1,4 +1,4 @@
-"""Particles that carry their velocity, and the momentum of those around them."""
+"""Inertia: rigid velocity fields, gains and orientations."""
 
 import dataclasses
 
@@ -32,7 +32,7 @@ def cross_matrix(w):
 
 
 def turning(n_steps, n=200, velocity=VELOCITY, spin=SPIN, seed=0):
-    """A ball of 20 cm that flies and turns, seen in ``n_steps``."""
+    """A ball of 20 cm that translates and rotates for ``n_steps``."""
     g = torch.Generator().manual_seed(seed)
     ball = torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=1) * 0.2
     history = make_history((n,) * n_steps, seed=seed, frozen_share=0.0)
@@ -44,7 +44,7 @@ def turning(n_steps, n=200, velocity=VELOCITY, spin=SPIN, seed=0):
 
 
 def flying(n_steps=2, **options):
-    """As :func:`turning`, its rows with the velocity that brought them to where they are."""
+    """As :func:`turning`, with the velocities of the last step."""
     history = turning(n_steps, **options)
     steps = history.means.unflatten(0, (n_steps, -1))
     velocity = torch.cat([torch.zeros_like(steps[:1]), steps[1:] - steps[:-1]])
@@ -62,7 +62,7 @@ def test_velocities_continue_rigid_motion():
 
 @pytest.mark.parametrize("squashed", [1.0, 0.2])
 def test_tumbling_body(squashed):
-    """Whatever its shape: ways of half a radian are chords, which an inertia of one end of them would misread."""
+    """For any shape: displacements are chords of a rotation by half a radian."""
     spin, size = (0.3, 0.0, -0.4), torch.tensor([1.0, 1.0, squashed])
     turn = torch.linalg.matrix_exp(cross_matrix(spin))
     now = (turning(1).means - 1 - 0.2) * size
@@ -94,7 +94,7 @@ def test_particles_without_velocity_rest():
 
 
 def test_impulse_changes_velocity_of_whole_body():
-    """Whatever the history says."""
+    """For any history."""
     still = torch.tensor([0.0, 0.01, 0.0]).expand(200, 3)
     history = flying()
     history = dataclasses.replace(history, velocity=torch.cat([history.velocity[:200], still]))
@@ -105,7 +105,7 @@ def test_impulse_changes_velocity_of_whole_body():
 
 
 def test_stopped_particles_turn_body():
-    """Friction: rows below stop, those above go on; the body falls forward about them."""
+    """Friction stops the lower particles, so the body tips over."""
     before = turning(1)
     low = before.means[:, 2] < 0.85
     assert 10 < low.sum() < 60
@@ -116,7 +116,7 @@ def test_stopped_particles_turn_body():
 
 
 def test_invalid_position_changes_no_other_particle():
-    """Neither features of others nor gradients."""
+    """Neither features nor gradients of others change."""
     history = flying()
     means = history.means.clone()
     means[250] = torch.nan
@@ -131,7 +131,7 @@ def test_invalid_position_changes_no_other_particle():
 
 @pytest.mark.parametrize("n", [40, 1500])
 def test_gradients_of_velocities(n):
-    """Of 1,500 rows 1,024 are looked at."""
+    """With 1,500 particles and 1,024 samples."""
     history = flying(n=n)
     history = dataclasses.replace(history, means=history.means.double())
     velocity = history.velocity.double().requires_grad_()
@@ -183,7 +183,7 @@ def test_edits_of_velocities():
 
 
 def test_network_reads_features():
-    """Without the columns that read it the next step is another one."""
+    """Zeroing the projections of the features changes the prediction."""
     dynamics, history = make_dynamics(CARRYING), flying()
     torch.nn.init.normal_(dynamics.priors.get("inertia").in_proj.weight)
     step = dynamics(history)
@@ -208,7 +208,7 @@ TURNING = with_priors(TINY, InertiaConfig(radius=LENGTH, rotate_appearance=True)
 
 
 def test_orientations_follow_body():
-    """Also on from where an edit turned it to."""
+    """Also after an edit that rotates the body."""
     history = flying()
     frozen = torch.arange(400) % 200 < 5
     history = dataclasses.replace(history, activity=torch.where(frozen, FROZEN, history.activity).to(torch.uint8))
@@ -229,7 +229,7 @@ def test_orientations_absent_without_rotated_appearance():
 
 
 def test_orientations_of_empty_or_invalid_scene():
-    """Nor where a place is none."""
+    """Also with invalid positions."""
     history = flying()
     empty = history.select_rows(torch.zeros(history.n_rows, dtype=torch.bool))
     assert make_dynamics(TURNING)(empty).orientations.shape == (0, 4)

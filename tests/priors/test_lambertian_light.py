@@ -1,4 +1,4 @@
-"""How much light reaches the surfaces that particles make, and a dynamics that lights them."""
+"""Lambertian light: irradiance of surfaces with shadows, and its use in the dynamics."""
 
 import dataclasses
 from functools import partial
@@ -24,7 +24,7 @@ LIT = with_priors(TINY, LAMBERT, grid_size=CELL)
 
 
 def irradiance(history, lights, cell, facing=None):
-    """[N, L] twice, the irradiance and the cosine of the newest particles."""
+    """Irradiance and cosine of the newest particles, [N, L] each."""
     return lambert(Movable(history, cell), lights, cell, LAMBERT, facing)
 
 
@@ -33,12 +33,12 @@ def opaque(history):
 
 
 def scene(n=2000, **options):
-    """A ball over a ground, of opaque rows."""
+    """Opaque particles of a ball over a ground."""
     return opaque(under_a_ball(n, **options))
 
 
 def parts(history, values):
-    """Places of the ground's rows from below the ball's middle, and of the ball's from there; and their values."""
+    """Positions of ground (from below the ball's center) and ball (from its center), and their values."""
     newest = last_steps(history, 1)
     moves, places = newest.activity == DYNAMIC, newest.means - 1.0
     return (places[~moves], values[~moves]), (places[moves] - torch.tensor([0.0, 0.0, HEIGHT]), values[moves])
@@ -118,7 +118,7 @@ def test_direction_gradient_matches_finite_difference():
     _, known = irradiance(history, light.detach(), CELL)
 
     def total(x):
-        """Of the ground: where rays of the ball begin is no function of the light to the gradient."""
+        """Irradiance of the ground; the start of rays at the ball has no gradient."""
         lit = irradiance(history, x, CELL, facing=known)[0]
         return (lit * weights)[last_steps(history, 1).activity == FROZEN].sum()
 
@@ -158,7 +158,7 @@ def test_invalid_positions_give_finite_results():
 
 
 def test_isolated_particle():
-    """Far from all others, where a window holds one row or none."""
+    """Windows of a distant particle hold one particle or none."""
     history = scene()
     means = history.means.clone()
     means[-3:] += torch.tensor([[5.0, 0.0, 0.0], [0.0, 7.0, 0.0], [0.0, 0.0, 9.0]])
@@ -183,7 +183,7 @@ def test_compiled(device):
 
 @pytest.mark.parametrize("background", ["symmetric", "relightable"])
 def test_irradiance_gain_is_ratio_times_prediction(background):
-    """That of where rows are over that of where they were encoded, times what is predicted."""
+    """Irradiance now over that at encoding, times the predicted gain."""
     dynamics, history = make_dynamics(dataclasses.replace(LIT, zero_init=True, background=background)), scene(600)
     strength = torch.tensor([[0.8, 1.0, 1.2], [0.1, 0.0, 0.3]])
     light_of(dynamics).strength.data = strength

@@ -1,4 +1,4 @@
-"""Only rows that may move are looked at, however many a computation has room for."""
+"""Movable particles: compaction, gradients, and independence of the capacity."""
 
 import dataclasses
 
@@ -25,7 +25,7 @@ CONDITIONED = with_priors(
 
 
 def scenes(device="cpu"):
-    """Two, one of which has fewer rows; the first row that may move is outside of the workspace."""
+    """Two scenes of different sizes; the first movable particle is outside the workspace."""
     history = with_attribute(
         batch([make_history((40, 40)), make_history((25, 25), seed=1, frozen_share=0.5)]), "velocity"
     )

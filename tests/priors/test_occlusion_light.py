@@ -1,4 +1,4 @@
-"""Occlusion of distant lights, and a network that reads it."""
+"""Optical depth towards directional lights, and its use in the dynamics."""
 
 import copy
 import dataclasses
@@ -30,7 +30,7 @@ HEIGHT, RADIUS, SPACING = 0.6, 0.2, 0.05
 
 
 def shade(history, lights, cell):
-    """[N, L], the optical depth of the newest particles."""
+    """Optical depth of the newest particles, [N, L]."""
     return optical_depth(Movable(history, cell), lights, cell, beam=2.0)
 
 
@@ -39,7 +39,7 @@ def light_of(dynamics):
 
 
 def under_a_ball(n=600, seed=0, n_steps=2, height=HEIGHT):
-    """A ground of frozen rows 5 cm apart, and a ball of 20 cm, the last ``n`` rows, over the middle of it; metres."""
+    """Frozen particles of a ground 5 cm apart, and a ball of 20 cm (the last ``n`` particles) over its center."""
     g = torch.Generator().manual_seed(seed)
     ticks = (torch.arange(41) - 20) * SPACING
     x, y = (v.flatten() for v in torch.meshgrid(ticks, ticks, indexing="ij"))
@@ -51,7 +51,7 @@ def under_a_ball(n=600, seed=0, n_steps=2, height=HEIGHT):
 
 
 def ground_of(history, lights=ZENITH):
-    """The shade of the ground's rows, and where they are around the middle."""
+    """Optical depth and positions of the ground's particles."""
     frozen = last_steps(history, 1).activity == FROZEN
     places = last_steps(history, 1).means[frozen] - 1.0
     return shade(history, lights, CELL)[frozen], places
@@ -91,7 +91,7 @@ def test_samples_stand_for_all_particles():
 
 
 def test_direction_gradient_matches_finite_difference():
-    """Along every axis, in float64, beside finite differences."""
+    """Along every axis, in float64."""
     history = under_a_ball(300)
     history = dataclasses.replace(history, means=history.means.double())
     light = torch.tensor([[0.2, 0.1, 0.5]], dtype=torch.float64, requires_grad=True)
@@ -152,7 +152,7 @@ def test_compiled(device):
 
 
 def test_network_reads_occlusion_and_direction_has_gradient():
-    """Without the columns that read it the next step is another one. Gradients come from the irradiance of a step."""
+    """Zeroing the projections of the features changes the prediction; gradients flow through the irradiance."""
     dynamics, history = make_dynamics(LIT), under_a_ball(100)
     torch.nn.init.normal_(light_of(dynamics).in_proj.weight)
     torch.nn.init.normal_(light_of(dynamics).gain_head.weight)
@@ -193,7 +193,7 @@ def test_irradiance_gain_compares_now_with_encoding(background):
 
 
 def test_irradiance_gain_does_not_accumulate():
-    """It is asked anew in every step, of the places at which bodies are then."""
+    """It is computed anew in every step."""
     dynamics, history = make_dynamics(dataclasses.replace(LIT, zero_init=True)), under_a_ball()
     held = torch.zeros(history.n_rows, dtype=torch.bool)
     held[::3] = True
@@ -234,7 +234,7 @@ def test_asymmetric_background_is_refused():
 
 @pytest.mark.parametrize("light", [OCCLUSION, LAMBERT], ids=["occlusion", "lambert"])
 def test_shadow_follows_body_in_same_step(light):
-    """A step is lit as its particles are where it ends, and the next one begins with that."""
+    """A step has the light of its final positions, which the next step starts from."""
     config = with_priors(LIT, light, grid_size=CELL, zero_init=True)
     dynamics, history = make_dynamics(config), under_a_ball()
     names = [name for name, n in dynamics.layout.outputs for _ in range(n)]

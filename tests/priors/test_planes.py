@@ -1,4 +1,4 @@
-"""Planes that fit rows within windows."""
+"""Weighted plane fits."""
 
 import pytest
 import torch
@@ -9,7 +9,7 @@ LENGTH = 0.05  # metres
 
 
 def _flat(n: int = 200) -> torch.Tensor:
-    """Points [1, n, 3] of a horizontal square of 10 cm, a metre away."""
+    """Points [1, n, 3] of a horizontal square of 10 cm at a distance of 1 m."""
     points = torch.rand(1, n, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([0.1, 0.1, 0.0])
     return points + torch.tensor([0.6, -0.5, 0.4])
 

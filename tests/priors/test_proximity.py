@@ -1,4 +1,4 @@
-"""The way from movable particles to the static background near them, and a network that reads it."""
+"""Proximity to the static background and position waves, and their use in the dynamics."""
 
 import dataclasses
 
@@ -27,7 +27,7 @@ def contact(history, priors=None):
 
 
 def above_ground(heights, seed=0, slope=0.0, n_steps=2):
-    """Rows over the middle of a square of frozen ones 5 cm apart, whose height rises along x; metres."""
+    """Particles over the center of a square of frozen particles 5 cm apart, with a slope along x."""
     ticks = torch.arange(31) * SPACING
     x, y = (v.flatten() for v in torch.meshgrid(ticks, ticks, indexing="ij"))
     ground = torch.stack([x, y, slope * (x - 0.75)], 1)

@@ -1,4 +1,4 @@
-"""Which rows are one body."""
+"""Segmentation of particles into bodies."""
 
 import dataclasses
 
@@ -22,7 +22,7 @@ MIN_SHARE, NEIGHBORS = SegmentationConfig().min_share, SegmentationConfig().neig
 
 
 def bodies(history):
-    """[N, 3] metres, the middle of each particle's body."""
+    """Center of each particle's body [N, 3]."""
     return context(dataclasses.replace(history, body=None), SegmentationConfig(), grid_size=CELL).history.body
 
 
@@ -31,7 +31,7 @@ def generator(seed=0):
 
 
 def shell(radius, middle, n, seed=0):
-    """[n, 3] on a sphere, as evenly as encoded pixels are, some of them off by a centimetre."""
+    """Points [n, 3] on a sphere with the spacing of encoded pixels; some have an error of 1 cm."""
     k = torch.arange(n) + 0.5
     z, angle = 1 - 2 * k / n, 2.399963 * k
     at = torch.stack([(1 - z * z).sqrt() * angle.cos(), (1 - z * z).sqrt() * angle.sin(), z], 1)
@@ -39,14 +39,14 @@ def shell(radius, middle, n, seed=0):
 
 
 def tube(radius, thickness, middle, n, seed=0):
-    """[n, 3] of a torus."""
+    """Points [n, 3] on a torus."""
     a, b = 6.2832 * torch.rand(2, n, generator=generator(seed))
     ring = radius + thickness * b.cos()
     return torch.stack([ring * a.cos(), ring * a.sin(), thickness * b.sin()], 1) + torch.tensor(middle)
 
 
 def scene(*parts, seed=0):
-    """One step of a scene whose rows, in any order, are at the places of ``parts``; and int64, the part of each."""
+    """A scene of one step with the particles of ``parts`` in random order, and the part of each (int64)."""
     places = torch.cat(parts)
     part = torch.cat([torch.full((len(x),), k) for k, x in enumerate(parts)])
     order = torch.randperm(len(places), generator=generator(seed))
@@ -55,12 +55,12 @@ def scene(*parts, seed=0):
 
 
 def separated(history):
-    """The middles that rows know, and the number of that of each."""
+    """Centers of bodies, and the index of the body of each particle."""
     return bodies(history).unique(dim=0, return_inverse=True)
 
 
 def test_gap_separates_bodies():
-    """Of 6 cm, where rows are 2 cm apart."""
+    """A gap of 6 cm at a spacing of 2 cm."""
     history, part = scene(shell(0.2, (1.0, 1.0, 1.0), 900), shell(0.15, (1.41, 1.0, 1.0), 500, seed=1))
     middles, body = separated(history)
     assert len(middles) == 2

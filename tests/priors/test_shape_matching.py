@@ -1,4 +1,4 @@
-"""Rest shapes of bodies, and the displacements that restore them."""
+"""Shape matching: residuals to the rest shape, and elastic displacements."""
 
 import dataclasses
 import math
@@ -31,7 +31,7 @@ def residual(history, radius=LENGTH, priors=None):
 
 
 def bent(matrix, n=300, seed=0, frozen_share=0.0):
-    """A ball of 10 cm, around (1, 1, 1) at first; now at (1.2, 1, 0.9), its places multiplied by ``matrix``."""
+    """A ball of 10 cm with rest center (1, 1, 1), now at (1.2, 1, 0.9) and deformed by ``matrix``."""
     g = torch.Generator().manual_seed(seed)
     ball = 0.1 * torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=1)
     history = make_history((n,), seed=seed, frozen_share=frozen_share)
@@ -54,7 +54,7 @@ def test_best_rotation_of_points(size):
 
 
 def test_best_rotation_matches_polar_decomposition():
-    """Of products of any matrix, as the polar decomposition has it."""
+    """For random matrices."""
     g = torch.Generator().manual_seed(2)
     products = torch.eye(3) + 0.3 * torch.randn(40, 3, 3, generator=g, dtype=torch.float64)
     u, _, vh = torch.linalg.svd(products)
@@ -75,7 +75,7 @@ def test_rigid_motion_has_no_residual(degrees):
 
 @pytest.mark.parametrize("turn", [torch.eye(3), QUARTER])
 def test_residual_of_squeezed_body(turn):
-    """In a window that is larger than the body, so that all of it counts."""
+    """With a window larger than the body."""
     history = bent(turn @ SQUEEZED)
     way = residual(history, 1.0)
     expected = (history.rest_positions - 1) @ turn.T - (history.means - torch.tensor([1.2, 1.0, 0.9]))
@@ -153,7 +153,7 @@ def test_untrained_rollout_restores_shape():
 
 
 def test_network_reads_features():
-    """Without the columns that read it the next step is another one."""
+    """Zeroing the projections of the features changes the prediction."""
     dynamics, history = make_dynamics(ELASTIC), bent(SQUEEZED)
     torch.nn.init.normal_(dynamics.priors.get("shape_matching").in_proj.weight)
     step = dynamics(history)

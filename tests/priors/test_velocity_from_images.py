@@ -1,4 +1,4 @@
-"""Velocities of encoded particles, found in images."""
+"""Velocities of encoded particles by photometric alignment."""
 
 import dataclasses
 
@@ -33,7 +33,7 @@ def cross_matrix(w):
 
 
 def ring(n_views, image_cloud, size=SIZE):
-    """Cameras all around (1, 1, 1), 2 m away, one behind the other ``n_views`` for each cloud."""
+    """``n_views`` cameras a cloud around (1, 1, 1) at a distance of 2 m."""
     viewmats = []
     for k in range(len(image_cloud)):
         angle = torch.tensor(6.2832 * (k % n_views) / n_views + 0.3)
@@ -51,7 +51,7 @@ def ring(n_views, image_cloud, size=SIZE):
 
 
 def image_of(camera, viewmat, middle, turn, painted, lit):
-    """[3, H, W] of a ball, and bool [H, W], where it is seen."""
+    """Image of a ball [3, H, W] and its mask bool [H, W]."""
     v, u = torch.meshgrid(*(torch.arange(camera.height) + 0.5,) * 2, indexing="ij")
     rays = torch.stack([u, v, torch.ones_like(u)], 2) @ torch.linalg.inv(camera.Ks[0]).T @ viewmat[:3, :3]
     rays = torch.nn.functional.normalize(rays, dim=2)
@@ -65,7 +65,7 @@ def image_of(camera, viewmat, middle, turn, painted, lit):
 
 
 def filmed(velocity=VELOCITY, spin=SPIN, n_steps=4, n=3000, n_views=4, lit=True, seed=0):
-    """A painted ball that flies and turns in the light of a lamp, and particles as they are encoded of its surface."""
+    """Images of a textured ball that translates and rotates under a light, and encoded particles of its surface."""
     g = torch.Generator().manual_seed(seed)
     ball = torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=1) * (RADIUS - INSIDE)
     waves = 12 * torch.randn(3, 3, generator=g)
@@ -85,7 +85,7 @@ def filmed(velocity=VELOCITY, spin=SPIN, n_steps=4, n=3000, n_views=4, lit=True,
 
 
 def motion_of(particles, found):
-    """Velocity and spin that fit what was found of the newest cloud."""
+    """Rigid motion fitted to the estimated velocities of the newest cloud."""
     newest = last_steps(particles, 1)
     places = newest.means - newest.means.mean(0)
     fit = torch.linalg.lstsq(torch.cat([places, torch.ones(len(places), 1)], 1), found[-len(places) :]).solution
@@ -104,7 +104,7 @@ def test_velocity_and_spin_under_any_light(spin, lit):
 
 @pytest.mark.parametrize("spin", [(0.0, 0.0, 0.3), (0.25, -0.1, 0.1)])
 def test_velocity_of_tumbling_body(spin):
-    """Since the oldest step by 0.9 rad: more than is found again without the spin of the last step."""
+    """A rotation of 0.9 rad since the oldest step needs the spin of the last step as a start."""
     particles, frames = filmed(spin=spin)
     particles = dataclasses.replace(particles, body=torch.ones_like(particles.means))
     found = follow(particles, frames)
@@ -115,7 +115,7 @@ def test_velocity_of_tumbling_body(spin):
 
 
 def test_noisy_positions():
-    """Those of encoded rows are, by about a centimetre."""
+    """Encoded positions with an error of about 1 cm."""
     particles, frames = filmed()
     noise = 0.01 * torch.randn(particles.means.shape, generator=torch.Generator().manual_seed(1))
     noisy = dataclasses.replace(particles, means=particles.means + noise)
@@ -136,7 +136,7 @@ def test_only_movable_particles_of_newest_cloud():
 
 @pytest.mark.parametrize("n_steps", [2, 4])
 def test_gravity_gives_velocity_of_last_step(n_steps):
-    """By half of gravity for every step but one between the oldest and the newest."""
+    """The correction is half of gravity for every step but one between the oldest and the newest."""
     particles, frames = filmed(n_steps=n_steps)
     gravity = torch.tensor([0.001, 0.0, -0.004])
     newest = particles.row_cloud() == n_steps - 1

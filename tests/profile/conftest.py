@@ -1,4 +1,4 @@
-"""A small trained-looking simulator and two held-out scenes."""
+"""A small simulator with random weights and two scenes."""
 
 import pytest
 import torch

@@ -1,17 +1,17 @@
-"""A clock that moves with the work of a fake device, and a simulator whose sections take given times on it."""
+"""A fake clock with a simulated device queue, and a simulator whose sections take known times."""
 
 import torch
 from torch import nn
 
 
 class Mark:
-    """A point in the device's work; of a graph, passed in every replay."""
+    """A time stamp in the device's queue; in a graph, updated by every replay."""
 
     at = None
 
 
 class FakeClock:
-    """A device that works through its queue while the host runs on; ``wait`` lets the host catch up.
+    """A device with an asynchronous queue; ``wait`` synchronizes the host.
 
     Args:
         host_share: seconds of the host for a second of work.
@@ -63,7 +63,7 @@ class FakeClock:
 
 
 class FakeGraph:
-    """The work of a function on a clock's device, as one launch."""
+    """The device work of a function, captured as one launch."""
 
     def __init__(self, function, clock):
         function()  # tried out before, as of a real one

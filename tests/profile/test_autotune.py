@@ -1,4 +1,4 @@
-"""Presets keep what they promise, limits are kept, and what was tuned is found again."""
+"""Tuned presets retain their share of the gain, limits hold, and saved speeds load."""
 
 import dataclasses
 import json
@@ -35,7 +35,7 @@ def all_points(point):
 
 @pytest.fixture
 def fake(case, monkeypatch):
-    """(sweep, settings that it measured together): each of them takes 3 s and agrees to 55 dB."""
+    """(sweep, list of measured settings); every measurement gives 3 s and 55 dB."""
     sweep, measured = Sweep(case, SHORT), []
 
     def run(points):
@@ -48,8 +48,8 @@ def fake(case, monkeypatch):
     return sweep, measured
 
 
-def test_presets_keep_their_promises(case):
-    """Verified anew: the tuned setting is run again, and its gain compared with that of the reference."""
+def test_presets_retain_their_share_of_the_gain(case):
+    """Runs the tuned settings again and compares their gain with that of the reference."""
     sweep = Sweep(case, SHORT)
     settings = (Setting(), Setting(history=1), Setting(kept=0.5), Setting(kept=0.05), Setting(grid=2.0))
     points = [sweep.point(setting, "", "model") for setting in settings]
@@ -66,8 +66,8 @@ def test_presets_keep_their_promises(case):
     assert autotune.keeping(case, points[0], 1.0)(points[0])
 
 
-def test_settings_that_keep_the_promise_are_added_up(fake):
-    """Two that help alone are measured together; one that ties, fails or breaks the promise is not taken."""
+def test_fastest_combines_useful_settings(fake):
+    """Combines two useful settings; ties, failures and inaccurate settings are left out."""
     sweep, measured = fake
     points = [
         at(Setting(), 10.0, 100.0),
@@ -82,8 +82,8 @@ def test_settings_that_keep_the_promise_are_added_up(fake):
     assert autotune.fastest(sweep, points, lambda p: p.agreement.psnr >= 40) is best and len(measured) == 1
 
 
-def test_setting_must_save_more_than_its_graph_does(fake):
-    """Every replay is faster than the launched reference; what saves nothing beside the graph is not tried."""
+def test_fastest_skips_settings_without_gain_over_graph(fake):
+    """A captured setting must be faster than graph capture alone."""
     sweep, measured = fake
     points = [
         at(Setting(), 10.0, 100.0),
@@ -97,13 +97,13 @@ def test_setting_must_save_more_than_its_graph_does(fake):
     assert autotune.fastest(sweep, points[:3], all_points) is points[1]
 
 
-def test_settings_that_do_not_fit_each_other_are_not_combined(fake):
+def test_fastest_skips_conflicting_settings(fake):
     sweep, measured = fake
     points = [at(Setting(), 10.0, 100.0), at(Setting(captured=True), 6.0, 100.0), at(Setting(sleep=0.1), 8.0, 99.0)]
     assert autotune.fastest(sweep, points, all_points) is points[1] and not measured
 
 
-def test_tie_with_the_fastest_is_decided_by_agreement(fake):
+def test_tied_settings_are_chosen_by_agreement(fake):
     points = [
         at(Setting(), 10.0, 100.0),
         at(Setting(history=1), 5.0, 40.0, other_round=5.2),
@@ -112,14 +112,14 @@ def test_tie_with_the_fastest_is_decided_by_agreement(fake):
     assert autotune.fastest(fake[0], points, all_points) is points[2]
 
 
-def test_no_combination_is_tried_when_the_time_is_over(fake):
+def test_fastest_stops_at_time_limit(fake):
     sweep, measured = fake
     sweep.limit = TimeLimit(1.0, iter([0.0, *[2.0] * 9]).__next__)
     points = [at(Setting(), 10.0, 100.0), at(Setting(history=1), 6.0, 60.0), at(Setting(grid=2.0), 8.0, 70.0)]
     assert autotune.fastest(sweep, points, all_points) is points[1] and not measured
 
 
-def test_autotune_keeps_limits(case):
+def test_autotune_respects_limits(case):
     few = {"groups": [group for group in GROUPS if group.name in ("history", "grid size")], "effort": SHORT}
     tuned = gsim3d.autotune(case, min_agreement_psnr=30.0, **few)
     case.compare(again := Point(tuned.setting, "", "model"))
@@ -143,7 +143,7 @@ def restored(case):
     return dataclasses.replace(case.restored, checkpoint=Checkpoint({}, {}, digest="1f"))
 
 
-def test_tuned_presets_are_found_again(tmp_path, restored):
+def test_speeds_round_trip(tmp_path, restored):
     other = dataclasses.replace(restored, checkpoint=Checkpoint({}, {}, digest="2e"))
     autotune.save_speeds(tmp_path, restored, {"fast": at(Setting(history=1, kept=0.9), 1.0, 50.0)})
     autotune.save_speeds(tmp_path, other, {"fast": at(Setting(grid=2.0), 1.0, 50.0)})
@@ -159,7 +159,7 @@ def test_tuned_presets_are_found_again(tmp_path, restored):
         speed_of(tmp_path, restored, "fast")
 
 
-def test_sections_are_summed_to_parts(case):
+def test_part_times_sum_sections(case):
     times = autotune.part_times(case, REFERENCE)
     assert (times.dynamics, times.gaussians, times.images, times.host) == pytest.approx((6.0, 4.0, 5.0, 0.0))
     newest = [case.newest(number).activity for number in range(2)]
@@ -170,7 +170,7 @@ def test_sections_are_summed_to_parts(case):
     assert autotune.part_times(case, Point(Setting(), "", "exact", step=(Timing((0.015,), {}),))) is None
 
 
-def test_milliseconds_grow_as_multiply_adds(case):
+def test_predicted_times_scale_with_multiply_adds(case):
     simulator = case.restored.simulator
     own, masked = simulator.plan(), simulator.plan(EffectsSpec(DynamicsEffects("masked_out")))
     same = MEASURED.predicted(own, own, simulator.config, MEASURED.work)
@@ -187,7 +187,7 @@ def test_milliseconds_grow_as_multiply_adds(case):
         assert 0 < found[part] < measured and found[part] == pytest.approx(measured * after[part] / before[part])
 
 
-def test_times_are_kept_beside_presets(tmp_path, restored):
+def test_part_times_round_trip(tmp_path, restored):
     assert load_times(tmp_path, restored) == {}
     autotune.save_speeds(tmp_path, restored, {"exact": REFERENCE})
     assert load_times(tmp_path, restored) == {}
@@ -207,14 +207,14 @@ def test_times_are_kept_beside_presets(tmp_path, restored):
         ({"work": {"moving": 3}}, "speeds.json: cpu: measured: work.frozen: this setting is missing"),
     ],
 )
-def test_damaged_times_are_refused(tmp_path, restored, change, message):
+def test_load_times_refuses_invalid_values(tmp_path, restored, change, message):
     values = dataclasses.asdict(MEASURED) | change
     (tmp_path / SPEEDS_FILE).write_text(json.dumps({"1f": {"cpu": {TIMES: values}}}))
     with pytest.raises(InputError, match=message):
         load_times(tmp_path, restored)
 
 
-def test_file_of_speeds_that_is_nested_without_end(tmp_path, restored):
+def test_load_times_refuses_deep_nesting(tmp_path, restored):
     (tmp_path / SPEEDS_FILE).write_text("[" * 100_000)
     with pytest.raises(InputError, match="speeds.json cannot be read: it is nested too deeply"):
         load_times(tmp_path, restored)

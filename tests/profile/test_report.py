@@ -1,4 +1,4 @@
-"""The report and the command: one page without a network, and numbers that agree between its files."""
+"""The report of ``gsim3d profile``: files agree, the page has no external resources, and the command."""
 
 import csv
 import importlib.util
@@ -22,7 +22,7 @@ SHORT = Effort(n_rounds=2, repeats=2, warm_up=0)
 
 @pytest.fixture(scope="module")
 def written(case, tmp_path_factory):
-    """(folder, points, what report.json holds)"""
+    """(folder, points, content of report.json)"""
     pytest.importorskip("matplotlib")
     out, sweep = tmp_path_factory.mktemp("report"), Sweep(case, SHORT)
     settings = {Setting(): "exact", Setting(history=1): "model", Setting(grid=2.0): "model"}
@@ -41,7 +41,7 @@ def written(case, tmp_path_factory):
     return out, points, content
 
 
-def test_files_agree(written):
+def test_report_files_agree(written):
     out, points, content = written
     names = {"report.json", "report.csv", "report.html", "cost.png", "sections.png", "horizon.png"}
     assert {file.name for file in out.iterdir()} == names
@@ -54,7 +54,7 @@ def test_files_agree(written):
     assert sum(content["settings"][0]["step_ms"]["sections"].values()) > 0
 
 
-def test_page_needs_nothing_from_elsewhere(written):
+def test_page_has_no_external_files(written):
     page = (written[0] / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 3
     assert not re.findall(r"(?:src|href)=['\"](?!data:)", page) and "<script" not in page
@@ -63,7 +63,7 @@ def test_page_needs_nothing_from_elsewhere(written):
     assert "111 steps a second in a batch of 4 scenes" in page and "<li>fast: history 1" in page
 
 
-def test_kept_is_the_share_of_the_gain(written):
+def test_retained_share_of_the_gain(written):
     content = written[2]
     reference, other = content["settings"][:2]
     assert reference["kept"] == 1 and content["presets"] == {"exact": 0, "balanced": 0, "fast": 1}
@@ -79,7 +79,7 @@ def test_share_in_words():
     assert [report.share_in_words(v) for v in (None, 0.9991, -3.0, 7.0)] == ["-", "99.91%", "below 0", "above 200%"]
 
 
-def test_table_names_failures_and_ties(written):
+def test_table_shows_failures_and_ties(written):
     content = json.loads(json.dumps(written[2]))
     content["settings"][2]["tie_with_reference"] = True
     lines = report.table(content).splitlines()
@@ -124,7 +124,7 @@ def test_command_writes_report_and_speeds(arguments, run, tmp_path, capsys):
     assert parts == pytest.approx(sum(content["settings"][0]["step_ms"]["sections"].values()))
 
 
-def test_command_names_what_there_was_no_time_for(arguments, tmp_path):
+def test_command_lists_settings_skipped_by_time_limit(arguments, tmp_path):
     assert main([*arguments, "--minutes", "1e-4", "--settings", "history", "grid size"]) == 0
     content = json.loads((tmp_path / "out" / "report.json").read_text())
     assert [row["name"] for row in content["settings"]] == ["reference"] and content["throughput"] == []
@@ -147,7 +147,7 @@ def test_wrong_arguments_are_one_line(capsys, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_report_goes_into_the_documentation(written, tmp_path):
+def test_ship_report_copies_report_and_speeds(written, tmp_path):
     spec = importlib.util.spec_from_file_location("ship_report", ROOT / "tools" / "release" / "ship_report.py")
     tool = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(tool)

@@ -1,4 +1,4 @@
-"""Settings: groups are declared once, each changes what it says, and a group without settings says why."""
+"""Settings: groups are unique, settings have their effect, and empty groups state their requirement."""
 
 import dataclasses
 
@@ -30,14 +30,14 @@ def test_groups_are_declared_once(case):
     assert all(missing.values()) and "only float32" in missing["precision"]
 
 
-def test_quick_sweep_takes_the_ends(case):
+def test_quick_sweep_uses_ends_of_groups(case):
     points, _ = Sweep(case, QUICK).points()
     assert [p.setting.kept for p in points if p.group == "particles kept"] == [0.75, 0.1]
     assert max(sum(p.group == group.name for p in points) for group in GROUPS) == 2
 
 
-def test_settings_are_replayed_on_a_gpu_where_they_fit_a_graph():
-    """A setting that the host launches is as slow as the host, whatever it saves."""
+def test_gpu_settings_are_captured_if_possible():
+    """Uncaptured settings would be limited by launch overhead."""
 
     class OnGpu:
         device = torch.device("cuda")
@@ -66,13 +66,13 @@ def test_settings_are_replayed_on_a_gpu_where_they_fit_a_graph():
         ([1], "must be a mapping"),
     ],
 )
-def test_wrong_setting_is_refused(values, message):
+def test_setting_refuses_invalid_values(values, message):
     with pytest.raises(InputError, match=f"setting: .*{message}"):
         Setting.from_dict(values)
 
 
-def test_sleeping_scene_rests(case):
-    """With a threshold that everything is below, the whole scene rests once its patience is over."""
+def test_sleep_setting_puts_scene_to_sleep(case):
+    """With a high threshold, the whole scene sleeps after ``patience`` steps."""
     runner, log = case.runner(Setting(sleep=100.0)), RestLog()
     steps = list(runner.steps(case.start(runner, [0]), 12, log))
     assert len(steps) == 12 and log.resting_share > 0.5
@@ -84,7 +84,7 @@ def test_sleeping_scene_rests(case):
     assert runner.span(case.n_steps) == case.n_steps  # no particle sleeps in a first step
 
 
-def test_most_opaque_particles_are_kept(case):
+def test_kept_selects_most_opaque_particles(case):
     all_of_them = case.start(case.runner(), [0])
     kept = case.start(case.runner(Setting(kept=0.25)), [0])
     for cloud in range(all_of_them.n_clouds):
@@ -97,7 +97,7 @@ def test_most_opaque_particles_are_kept(case):
                 assert int((all_of_them.opacities[here] > least).sum()) < int(there.sum()) + 1
 
 
-def test_weak_gaussians_are_not_drawn(case):
+def test_least_opacity_skips_gaussians(case):
     runner, newest, cameras = case.runner(), case.newest(0), case.cameras([0], 0)
     whole = runner.images(newest, cameras)
     below = case.runner(Setting(least_opacity=1 / 255)).images(newest, cameras)
@@ -109,7 +109,7 @@ def test_weak_gaussians_are_not_drawn(case):
     assert not torch.equal(fewer, whole)
 
 
-def test_model_of_two_steps_a_call(case):
+def test_runner_with_two_steps_a_call(case):
     config = case.restored.simulator.config
     config = dataclasses.replace(config, dynamics=dataclasses.replace(config.dynamics, steps_per_call=2))
     simulator = type(case.restored.simulator)(config).eval()
@@ -119,8 +119,8 @@ def test_model_of_two_steps_a_call(case):
     assert len(runner.steps(two.start(runner, [0]), 3)) == 3 and runner.span(3) == 2
 
 
-def test_float64_finds_the_same_as_the_reference(case):
-    """The reference itself is validated by a run in double precision."""
+def test_reference_matches_float64(case):
+    """Validates the reference by a rollout in double precision."""
     import copy
 
     restored = case.restored

@@ -1,4 +1,4 @@
-"""A sweep: errors against the reference and the video, failures, times in rounds, and going on after an end."""
+"""Sweeps: errors against reference and video, failures, rounds of timings, and continuation."""
 
 import dataclasses
 
@@ -36,7 +36,7 @@ def points_of(sweep, *settings):
 
 
 def timed(seconds, psnr, failure=""):
-    """A point of known time and PSNR against the reference."""
+    """A point with a given step time and agreement PSNR."""
     return Point(Setting(), "", "exact", failure, Agreement(psnr, psnr, None, None), step=(Timing((seconds,)),))
 
 
@@ -46,7 +46,7 @@ def compared(case, setting):
     return point
 
 
-def test_reference_is_what_evaluate_predicts(case):
+def test_reference_matches_evaluate(case):
     scene, (context, targets) = case.scenes[0], case.views[0]
     prediction = predict(case.restored, scene, context, case.n_steps)
     expected = render_steps(case.restored, prediction.particles, scene, targets)[prediction.n_encoded :]
@@ -75,7 +75,7 @@ def test_reference_agrees_with_itself(case):
     ],
     ids=lambda value: getattr(value, "name", ""),
 )
-def test_setting_changes_what_it_says(case, setting, known):
+def test_settings_change_the_prediction(case, setting, known):
     agreement = compared(case, setting).agreement
     assert 5 < agreement.psnr < 100 and agreement.psnr_worst <= agreement.psnr
     if not known:
@@ -86,7 +86,7 @@ def test_setting_changes_what_it_says(case, setting, known):
         assert agreement.position_max > 0
 
 
-def test_failure_names_the_step_or_the_memory(case, monkeypatch):
+def test_failures_name_step_and_memory(case, monkeypatch):
     steps = Runner.steps
 
     def spoiled(self, *args):
@@ -109,8 +109,8 @@ def test_failure_names_the_step_or_the_memory(case, monkeypatch):
     assert points[0].failure == "out of memory" and not points[0].step
 
 
-def test_fvd_is_of_all_clips(case, monkeypatch):
-    """One distance between the clips of all scenes; the features are made up."""
+def test_fvd_uses_clips_of_all_scenes(case, monkeypatch):
+    """The distance is over the clips of all scenes (with fake features)."""
 
     def features(clips):
         return clips.double().mean((2, 3)).flatten(1)[:, :6]
@@ -124,7 +124,7 @@ def test_fvd_is_of_all_clips(case, monkeypatch):
     assert point.task["fvd"] == pytest.approx(expected) and "fvd" not in point.by_step
 
 
-def test_rounds_are_timed_in_another_order_each(case):
+def test_rounds_are_shuffled(case):
     said = []
     sweep = Sweep(case, Effort(n_rounds=3, repeats=2, warm_up=0), progress=said.append)
     points = points_of(sweep, Setting(), Setting(history=1), Setting(kept=0.5))
@@ -140,12 +140,12 @@ def test_rounds_are_timed_in_another_order_each(case):
         assert sum(point.sections().values()) == pytest.approx(point.step_seconds, rel=0.5)
 
 
-def test_front_holds_what_no_point_beats():
+def test_front_is_the_pareto_front():
     a, b, c, d = timed(1.0, 20.0), timed(2.0, 50.0), timed(3.0, 40.0), timed(0.5, 60.0, failure="out of memory")
     assert front([a, b, c, d], lambda p: -p.agreement.psnr) == [a, b]
 
 
-def test_near_times_are_a_tie():
+def test_tie_within_spread():
     a, b = timed(1.0, 20.0), timed(1.1, 20.0)
     a.step += (Timing((1.2,)),)  # rounds of a are 0.2 s apart
     assert tie(a, b) and not tie(timed(1.0, 20.0), timed(1.5, 20.0))
@@ -154,13 +154,13 @@ def test_near_times_are_a_tie():
     assert single.spread == pytest.approx(0.2) and tie(single, timed(1.15, 20.0))
 
 
-def test_case_is_as_short_as_asked(case):
+def test_case_n_steps(case):
     assert BenchmarkCase(case.restored, case.scenes, 2).n_steps == 2
     assert case.n_steps == case.scenes[0].n_steps - 2
 
 
-def test_time_limit_leaves_out_what_comes_last(case):
-    """The reference and one round are always there."""
+def test_time_limit_skips_later_settings(case):
+    """The reference and one round are always measured."""
     seconds = iter([0.0, 0.1, 0.1, *[50.0] * 100])
     sweep = Sweep(case, Effort(n_rounds=3, repeats=2, warm_up=0), TimeLimit(100.0, lambda: next(seconds)))
     points = points_of(sweep, Setting(), Setting(kept=0.5), Setting(grid=2.0))
@@ -169,8 +169,8 @@ def test_time_limit_leaves_out_what_comes_last(case):
     assert len(points[0].step) == len(points[1].step) >= 1 and not points[2].step
 
 
-def test_ended_sweep_goes_on(case, tmp_path, monkeypatch):
-    """What was compared and timed is not repeated; under other conditions it is."""
+def test_interrupted_sweep_continues(case, tmp_path, monkeypatch):
+    """Saved results are reused, unless the conditions differ."""
     restored = dataclasses.replace(case.restored, checkpoint=Checkpoint({}, {}, digest="1f"))
     case, file, calls = BenchmarkCase(restored, case.scenes), tmp_path / "measured.json", []
     timing, compare = Sweep._timing, BenchmarkCase.compare
@@ -206,7 +206,7 @@ GRAPHS = [
 
 
 @pytest.mark.parametrize("setting", [Setting(captured=True), *GRAPHS], ids=lambda setting: setting.name)
-def test_replayed_setting_predicts_as_the_launched_one(case, setting):
+def test_captured_setting_matches_uncaptured(case, setting):
     clock, plain = DeviceClock(case.device), dataclasses.replace(setting, captured=False)
     stepping = Stepping(case, setting, clock)
     stepping()
@@ -220,8 +220,8 @@ def test_replayed_setting_predicts_as_the_launched_one(case, setting):
     torch.testing.assert_close(rendered.renderings[0].color.clamp(0, 1), image, rtol=0, atol=1e-5)
 
 
-def test_sections_of_a_graph_leave_gaps_of_the_host(case):
-    """Of a launched setting; a replayed one has none."""
+def test_sections_of_graph_give_host_gaps(case):
+    """Only uncaptured settings have host gaps."""
     whole, sweep = Timing((5.0, 5.0)), Sweep(case)
     launched = sweep.sections_of_graph(Setting(), whole)
     assert sum(launched.values()) == pytest.approx(5.0) and launched["host gaps"] > 1.0
@@ -229,7 +229,7 @@ def test_sections_of_a_graph_leave_gaps_of_the_host(case):
     assert "host gaps" not in sweep.sections_of_graph(Setting(captured=True), whole)
 
 
-def test_batch_looks_as_each_scene_alone(case):
+def test_batch_images_match_single_scenes(case):
     runner = case.runner()
     images = runner.images(runner.steps(case.start(runner, [0, 1]), 1)[0], case.cameras([0, 1], 0))
     for number in range(2):

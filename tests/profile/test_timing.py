@@ -1,4 +1,4 @@
-"""Timings and their sections, on a clock that moves with the work of a fake device."""
+"""Timings and sections, on a fake device with known times."""
 
 import pytest
 import torch
@@ -21,13 +21,13 @@ def watched_call(clock, repeats=5):
     return time_call(call, clock, repeats, sections=lambda: stopwatch.seconds)
 
 
-def test_sections_add_up_to_the_whole():
+def test_sections_sum_to_total():
     found = watched_call(FakeClock())
     assert found.median == pytest.approx(6.5e-3) and found.sections == pytest.approx(SECTIONS)
     assert list(found.sections) == [name for name in timing.SECTIONS if name in SECTIONS]
 
 
-def test_section_within_another_counts_as_itself_only():
+def test_nested_section_counts_for_itself():
     clock = FakeClock()
     stopwatch = Stopwatch(clock)
     with stopwatch.running():
@@ -42,8 +42,8 @@ def test_section_within_another_counts_as_itself_only():
 
 
 @pytest.mark.parametrize("cost", [0.0, 0.2e-3])
-def test_sections_of_a_graph_are_those_of_every_replay(cost):
-    """Neither the host nor the marks are in them, and what is run before the capture has no marks."""
+def test_graph_stopwatch_times_every_replay(cost):
+    """Sections exclude host time and the cost of marks; warm-up runs before the capture are not recorded."""
     clock = FakeClock(launch=4e-3, cost=cost)
     simulator, stopwatch = FakeSimulator(clock), GraphStopwatch(clock)
     with watched(simulator, stopwatch), stopwatch.capturing():
@@ -74,11 +74,11 @@ def test_timing_waits_for_the_device():
     assert time_call(lambda: clock.work(3.0), clock, repeats=2).repeats == (3.0, 3.0)
 
 
-def test_timing_of_several_steps_is_split():
+def test_timing_split_over_steps():
     assert Timing((2.0, 4.0), {"head": 1.0}).split_over(2) == Timing((1.0, 2.0), {"head": 0.5})
 
 
-def test_watched_puts_ops_back():
+def test_watched_restores_ops():
     before = torch.ops.gsim3d.unpool
     with pytest.raises(KeyError, match="fails"):
         with watched(FakeSimulator(FakeClock()), Stopwatch(FakeClock())):
@@ -87,7 +87,7 @@ def test_watched_puts_ops_back():
     assert torch.ops.gsim3d.unpool is before
 
 
-def test_clock_of_a_device(device):
+def test_device_clock_measures_work(device):
     clock = DeviceClock(device)
     first, start = clock.mark(), clock.now()
     torch.randn(500, 500, device=device) @ torch.randn(500, 500, device=device)
@@ -96,7 +96,7 @@ def test_clock_of_a_device(device):
     assert 0 < clock.seconds(first, last) < 10 and clock.now() > start
 
 
-def test_marks_are_part_of_a_graph(device):
+def test_device_clock_marks_in_graph(device):
     clock = DeviceClock(device)
     assert not clock.capturing()
     if torch.device(device).type == "cpu":

@@ -1,4 +1,4 @@
-"""`gsim3d bound`: exact without errors, errors of the length that they should have, sums, resuming, refusals."""
+"""`gsim3d bound`: reproduction without errors, magnitudes of errors, summary, continuation and error messages."""
 
 import dataclasses
 import json

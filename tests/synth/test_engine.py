@@ -1,4 +1,4 @@
-"""Motion by MuJoCo: free fall, contact, materials, energy, cloth; and what is tied to the nodes that it moves."""
+"""MuJoCo engine: free fall, contact, materials, energy and cloth; bindings of surfaces to nodes."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Whole data sets: layout, determinism, resuming, options, errors, and what the demo's scenes show."""
+"""Generated data sets: layout, determinism, continuation, options, errors and content of scenes."""
 
 import argparse
 import dataclasses

@@ -1,4 +1,4 @@
-"""Which set scenes are of, what is scored of it by default, and that no training sees it."""
+"""Held-out sets: recognition, default scores, and exclusion from training."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Mesh files of several objects, materials and kinds: all bodies and colours arrive, or the file is refused by name."""
+"""Mesh files: all objects, materials and colours are read, or the file is refused."""
 
 import struct
 
