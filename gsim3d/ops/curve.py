@@ -344,6 +344,7 @@ def build_pyramid(
     curves: tuple[tuple[int, ...], ...] | None = None,
     capacity: PyramidCapacity | None = None,
     rounded: bool = False,
+    depth: int | None = None,
 ) -> Pyramid:
     """All geometry of a call of the dynamics network.
 
@@ -365,6 +366,10 @@ def build_pyramid(
         capacity: sizes of the results; None: what the data needs.
         rounded: sizes are what the data needs and up to one part in 32 more, so that many calls share few sizes, which
             libraries of matrix products choose an algorithm for; not with ``capacity``.
+        depth: levels of the curves, 1 to 16, where they are to be those of another project (Pointcept: the bits of the
+            largest coordinate of a cell in the call; see :class:`gsim3d.nn.PointTransformerV3`). A row outside
+            [0, 2^depth) cells sleeps; a stride of more levels than are left pools none. Default 16; not with
+            ``spec.release``.
     Returns:
         Pyramid; tensors int64 on the device of ``positions``. On CUDA the call waits once, for the sizes; with
         ``capacity`` never: a CUDA graph can capture it, and ``Pyramid.found`` tells later whether the data fitted.
@@ -394,6 +399,9 @@ def build_pyramid(
         _check_spec(spec, curves)
         if not (capacity is None or isinstance(capacity, PyramidCapacity)):
             raise TypeError(f"build_pyramid: capacity must be a PyramidCapacity; got {type(capacity).__name__}")
+        check_whole("build_pyramid", **({} if depth is None else {"depth": depth}))
+        if depth is not None and not 1 <= depth <= 16:
+            raise ValueError(f"build_pyramid: depth must be in [1, 16]; got {depth}")
         if not isinstance(rounded, bool):
             raise TypeError(f"build_pyramid: rounded must be true or false; got {rounded!r}")
     if curves is None:
@@ -416,6 +424,7 @@ def build_pyramid(
         spec.release,
         () if capacity is None else capacity.sizes,
         rounded,
+        depth or 0,
     )
     counts = None
     if rounded and not torch.compiler.is_compiling():
@@ -504,6 +513,7 @@ def _(
     release,
     capacity,
     rounded=False,
+    depth=0,
 ):
     n_counts = len(PyramidCapacity.COUNTS) * len(patch_sizes)
     of_stages, of_maps = iter(capacity[:n_counts]), iter(capacity[n_counts:])

@@ -67,7 +67,7 @@ std::vector<Tensor> build_pyramid(const Tensor& positions_, const Tensor& cu_row
                                   std::vector<int64_t> strides, std::vector<int64_t> merge_windows,
                                   std::vector<int64_t> patch_sizes, std::vector<int64_t> curves,
                                   std::vector<int64_t> kernel_sizes, std::vector<int64_t> cu_kernels, bool release,
-                                  std::vector<int64_t> capacity, bool rounded) {
+                                  std::vector<int64_t> capacity, bool rounded, int64_t depth) {
   const char* op = "build_pyramid";
   const int64_t n_stages = static_cast<int64_t>(patch_sizes.size());
   const auto check_length = [&](const char* name, const std::vector<int64_t>& list, int64_t length) {
@@ -104,7 +104,7 @@ std::vector<Tensor> build_pyramid(const Tensor& positions_, const Tensor& cu_row
   const Tensor cloud_slot = rows_of(cloud_slot_), origin = rows_of(origin_);
   const PyramidSpec spec{grid_size,     slot_bits,           n_stages,          strides.data(), merge_windows.data(),
                          patch_sizes.data(), curves.data(), kernel_sizes.data(), cu_kernels.data(), release,
-                         capacity.empty() ? nullptr : capacity.data(), rounded};
+                         capacity.empty() ? nullptr : capacity.data(), rounded, depth};
   TensorArrays arrays{cu_rows, {}};
   TensorWorkspace workspace(cu_rows);
   dispatch_float(op, "positions", positions, [&]<typename T>() {

@@ -49,6 +49,9 @@ struct PyramidSpec {
   // Sizes are rounded up from what the data has, so that calls with similar data have the same ones; otherwise as with
   // `capacity`, which is null then.
   bool rounded = false;
+  // Levels of the curves, 1 to 16: a row whose cell does not fit sleeps, and a stride of more levels than are left pools
+  // none. 0: 16, or what `release` says.
+  int64_t depth = 0;
 };
 
 // What `capacity` and `found` count: rows, clouds, patches and keys of every stage, then the pairs of every kernel map.

@@ -50,7 +50,7 @@ __global__ void extent_kernel(const T* __restrict__ positions, int64_t n, uint64
 // Cell of a position; false where the row sleeps.
 template <typename T>
 __device__ __forceinline__ bool cell_of(const PyramidClouds<T>& clouds, int64_t i, double grid_size, bool release,
-                                        const uint64_t* extent, uint64_t& cell, uint32_t& top) {
+                                        double n_cells, const uint64_t* extent, uint64_t& cell, uint32_t& top) {
   const int64_t scene = clouds.scene[segment_of(clouds.cu_rows, clouds.n_clouds, i)];
   if (!inside(scene, clouds.n_scenes)) return false;
   const T* p = clouds.positions + 3 * i;
@@ -61,7 +61,7 @@ __device__ __forceinline__ bool cell_of(const PyramidClouds<T>& clouds, int64_t 
       v = static_cast<double>(trunc((p[a] - static_cast<T>(from_ordered(extent[a]))) / static_cast<T>(grid_size)));
     else
       v = floor((static_cast<double>(p[a]) - clouds.origin[3 * scene + a]) / grid_size);
-    if (!(v >= 0 && v < 65536)) return false;
+    if (!(v >= 0 && v < n_cells)) return false;
     cell = cell << 16 | static_cast<uint64_t>(v);
     largest = max(largest, static_cast<uint32_t>(v));
   }
@@ -71,7 +71,7 @@ __device__ __forceinline__ bool cell_of(const PyramidClouds<T>& clouds, int64_t 
 
 template <typename T>
 __global__ void __launch_bounds__(kThreads)
-    cells_kernel(PyramidClouds<T> clouds, double grid_size, bool release, Intake intake, Build build) {
+    cells_kernel(PyramidClouds<T> clouds, double grid_size, bool release, double n_cells, Intake intake, Build build) {
   const int64_t tile = tile_of(build.tickets), begin = tile * kScanTile + threadIdx.x, n = clouds.n_rows;
   uint32_t top = 0;
   bool awake[kScanItems];
@@ -79,7 +79,7 @@ __global__ void __launch_bounds__(kThreads)
   for (int j = 0; j < kScanItems; ++j) {
     const int64_t i = begin + j * kThreads;
     uint64_t cell = 0;
-    awake[j] = i < n && cell_of(clouds, i, grid_size, release, intake.extent, cell, top);
+    awake[j] = i < n && cell_of(clouds, i, grid_size, release, n_cells, intake.extent, cell, top);
     if (i < n) intake.cells[i] = awake[j] ? cell : ~uint64_t{0};
   }
   uint32_t before[kScanItems];
@@ -153,7 +153,8 @@ __global__ void order_clouds_kernel(PyramidClouds<T> clouds, int64_t slot_bits, 
 
 // The clouds of every stage from those of the stage before, and how many levels codes keep: one block, a chunk of
 // clouds at a time. A malformed call goes on without rows until the host sees its status.
-__global__ void __launch_bounds__(kPlanThreads) plan_stages_kernel(Build build, const uint32_t* top, bool release) {
+__global__ void __launch_bounds__(kPlanThreads)
+    plan_stages_kernel(Build build, const uint32_t* top, bool release, int given_depth) {
   using Scan = cub::BlockScan<uint32_t, kPlanThreads>;
   __shared__ typename Scan::TempStorage storage;
   const bool good = build.counts[0] == 0;
@@ -163,6 +164,7 @@ __global__ void __launch_bounds__(kPlanThreads) plan_stages_kernel(Build build, 
     int dropped = 0;
     for (int64_t s = 0; s < build.n_stages; ++s) dropped += build.drop[s];
     int depth = release ? min(33 - __clz(*top), kMaxDepth) : max(32 - __clz(*top), dropped);
+    if (given_depth > 0) depth = given_depth;
     for (int64_t s = 0; s < build.n_stages; ++s) {
       if (build.drop[s] > depth) build.drop[s] = 0;
       depth -= build.drop[s];
@@ -215,10 +217,11 @@ void find_clouds(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const 
     launch(kOp, extent_kernel<T>, blocks_of(n), kThreads, 0, stream, clouds.positions, n, intake.extent);
   }
   launch(kOp, cells_kernel<T>, blocks_for(kOp, tiles_of(n + 1), 1), kThreads, 0, stream, clouds, spec.grid_size,
-         spec.release, intake, build);
+         spec.release, static_cast<double>(int64_t{1} << (spec.depth > 0 ? spec.depth : kMaxDepth)), intake, build);
   launch(kOp, order_clouds_kernel<T>, blocks_of(std::max<int64_t>(clouds.n_clouds, 1)), kThreads, 0, stream, clouds,
          spec.slot_bits, intake, build);
-  launch(kOp, plan_stages_kernel, 1, kPlanThreads, 0, stream, build, intake.top, spec.release);
+  launch(kOp, plan_stages_kernel, 1, kPlanThreads, 0, stream, build, intake.top, spec.release,
+         static_cast<int>(spec.depth));
 }
 
 template <typename T>

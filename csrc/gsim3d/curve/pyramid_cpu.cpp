@@ -70,11 +70,11 @@ std::array<T, 3> minimum_corner(const PyramidClouds<T>& clouds, double grid_size
 
 // Cell of a position; false where the row sleeps.
 template <typename T>
-bool cell_of(const T* p, const double* origin, const T* corner, double grid_size, int64_t* cell) {
+bool cell_of(const T* p, const double* origin, const T* corner, double grid_size, int64_t n_cells, int64_t* cell) {
   for (int a = 0; a < 3; ++a) {
     const double v = corner ? static_cast<double>(std::trunc((p[a] - corner[a]) / T(grid_size)))
                             : std::floor((static_cast<double>(p[a]) - origin[a]) / grid_size);
-    if (!(v >= 0 && v < kCells)) return false;
+    if (!(v >= 0 && v < static_cast<double>(n_cells))) return false;
     cell[a] = static_cast<int64_t>(v);
   }
   return true;
@@ -86,6 +86,7 @@ Stage first_stage(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const
                   const Arrays& arrays, const Workspace& workspace, const Parallel& parallel) {
   std::array<T, 3> corner{};
   if (spec.release) corner = minimum_corner(clouds, spec.grid_size);
+  const int64_t n_cells = spec.depth > 0 ? int64_t{1} << spec.depth : kCells;
   int64_t* cells = workspace.take<int64_t>(3 * clouds.n_rows);
   uint8_t* awake = workspace.take<uint8_t>(clouds.n_rows);
   const int64_t n_chunks = (clouds.n_rows + kRowGrain - 1) / kRowGrain;
@@ -95,7 +96,7 @@ Stage first_stage(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const
       const double* origin = clouds.origin + 3 * clouds.scene[q];
       for (int64_t i = first; i < last; ++i) {
         awake[i] = cell_of(clouds.positions + 3 * i, origin, spec.release ? corner.data() : nullptr, spec.grid_size,
-                           cells + 3 * i);
+                           n_cells, cells + 3 * i);
         start[begin / kRowGrain + 1] += awake[i];
       }
     });
@@ -139,6 +140,7 @@ Stage first_stage(const PyramidClouds<T>& clouds, const PyramidSpec& spec, const
     for (int64_t i = 0; i < 3 * stage.n; ++i) top = std::max(top, stage.grid[i]);
     stage.depth = std::bit_width(static_cast<uint64_t>(top)) + 1;
   }
+  if (spec.depth > 0) stage.depth = static_cast<int>(spec.depth);
   for (auto& codes : stage.codes) codes = workspace.take<uint64_t>(stage.n);
   encode_all(stage.grid, stage.cloud, stage.n, stage.depth, stage.codes, parallel);
   return stage;
@@ -194,7 +196,7 @@ Stage next_stage(const Stage& before, int64_t stride, int64_t window, int64_t* s
                  const Workspace& workspace, const Parallel& parallel) {
   Stage stage;
   int drop = log2_of(stride);
-  if (drop > before.depth) drop = 0;  // the published model does not pool then; its depth follows the extent
+  if (drop > before.depth) drop = 0;  // published models do not pool then; their depth follows the extent
   stage.depth = before.depth - drop;
   const uint64_t* sorted = before.sorted0;
   int64_t n = 0;
@@ -242,6 +244,8 @@ void check_spec(const PyramidSpec& spec) {
   check(std::isfinite(spec.grid_size) && spec.grid_size > 0, op, ": grid_size must be positive; got ", spec.grid_size);
   check(spec.slot_bits >= 0 && spec.slot_bits <= kMaxSlotBits, op, ": slot_bits must be in [0, ", kMaxSlotBits,
         "]; got ", spec.slot_bits);
+  check(spec.depth >= 0 && spec.depth <= kMaxDepth, op, ": depth must be in [1, ", kMaxDepth, "]; got ", spec.depth);
+  check(spec.depth == 0 || !spec.release, op, ": depth must not be given with release, which has one of its own");
   int bits = 0;
   for (int64_t s = 0; s + 1 < spec.n_stages; ++s) {
     check(is_power_of_two(spec.strides[s]), op, ": strides must be powers of two; got ", spec.strides[s]);

@@ -19,7 +19,7 @@ constexpr const char* kOp = "build_pyramid";
 int log2_of(int64_t power_of_two) { return std::countr_zero(static_cast<uint64_t>(power_of_two)); }
 
 // Cells and codes of the rows that take part.
-template <bool kRelease>
+template <bool kWholeDepth>
 __global__ void encode_kernel(int64_t n, const int64_t* __restrict__ cu_rows, int64_t n_clouds, Intake intake,
                               Build build, uint64_t* __restrict__ codes) {
   const int64_t i = thread_index();
@@ -35,7 +35,7 @@ __global__ void encode_kernel(int64_t n, const int64_t* __restrict__ cu_rows, in
   const uint64_t high = id << 3 * depth;
 #pragma unroll
   for (int c = 0; c < kCurves; ++c)
-    codes[c * build.room + to] = high | curve_code(static_cast<Curve>(c), x, y, z, kRelease ? depth : kMaxDepth);
+    codes[c * build.room + to] = high | curve_code(static_cast<Curve>(c), x, y, z, kWholeDepth ? kMaxDepth : depth);
 }
 
 // Orders rows of equal codes by position, then by row: each row of a run counts those before it.
@@ -487,8 +487,8 @@ void build_pyramid(const PyramidClouds<T>& clouds, const PyramidSpec& spec, cons
   next_scan(1);
 
   // The first stage: one sort of the four curves.
-  launch(kOp, spec.release ? encode_kernel<true> : encode_kernel<false>, blocks_of(n), kThreads, 0, stream, n,
-         clouds.cu_rows, clouds.n_clouds, intake, build, scratch.run_codes);
+  launch(kOp, spec.release || spec.depth > 0 ? encode_kernel<false> : encode_kernel<true>, blocks_of(n), kThreads, 0,
+         stream, n, clouds.cu_rows, clouds.n_clouds, intake, build, scratch.run_codes);
   sort_rows(kOp,
             {.keys = scratch.run_codes,
              .n_rows = kCurves,

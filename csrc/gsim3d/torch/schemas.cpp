@@ -11,7 +11,7 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "build_pyramid(Tensor positions, Tensor cu_rows, Tensor cloud_scene, Tensor cloud_slot, Tensor origin, "
       "float grid_size, "
       "int slot_bits, int[] strides, int[] merge_windows, int[] patch_sizes, int[] curves, int[] kernel_sizes, "
-      "int[] cu_kernels, bool release, int[] capacity, bool rounded=False) -> Tensor[]");
+      "int[] cu_kernels, bool release, int[] capacity, bool rounded=False, int depth=0) -> Tensor[]");
 
   // sparse_conv: submanifold convolution over voxels; weight [C_out, K, K, K, C_in]. A plan is the order of rows and
   // the sources of their taps on CUDA, made once for all convolutions with a map.
