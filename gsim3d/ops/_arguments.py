@@ -57,6 +57,8 @@ def check_numbers(op: str, *, largest_of: float = math.inf, **tensors: Tensor | 
     for name, value in tensors.items():
         if value is None or value.device.type != "cpu" or value.dtype not in LARGEST or value.numel() == 0:
             continue
+        while torch._C._functorch.is_functorch_wrapped_tensor(value):  # all entries of a batch are looked at
+            value = torch._C._functorch.get_unwrapped(value)
         largest = min(LARGEST[value.dtype], largest_of)
         low, high = torch.aminmax(value.detach())
         if not (low >= -largest and high <= largest):  # NaN is in neither range

@@ -1,7 +1,8 @@
 """Registers fakes, gradients and rules of autocast; refuses gradients that an op does not have, by name.
 
-An op has a first derivative in reverse mode of the arguments that its rule knows. Other arguments that ask for a
-gradient, second derivatives and forward mode end with a :class:`gsim3d.GradientError`, never with None or 0.
+An op has a first derivative in reverse mode of the arguments that its rule knows. Where its gradients are ops with a
+rule themselves, it has higher ones; with rules of forward mode and vmap, the transforms of ``torch.func``.
+What it does not have ends with a :class:`gsim3d.GradientError`, never with None or 0.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from gsim3d.errors import GradientError
 from gsim3d.ops import _load  # noqa: F401
 
 _library = torch.library.Library("gsim3d", "FRAGMENT")
+_functions: dict[str, type[torch.autograd.Function]] = {}
 
 
 def fake(name: str) -> Callable[[Callable], Callable]:
@@ -25,8 +27,23 @@ def fake(name: str) -> Callable[[Callable], Callable]:
     return torch.library.register_fake(f"gsim3d::{name}")
 
 
+def alias(op: str, *, of: str) -> None:
+    """Defines gsim3d::``op``, which computes what gsim3d::``of`` does and may have other gradients."""
+    overload = getattr(torch.ops.gsim3d, of)
+    _library.define(str(overload.default._schema).removeprefix("gsim3d::").replace(of, op, 1))
+    _library.impl(op, lambda *arguments: overload(*arguments), "CPU")
+    _library.impl(op, lambda *arguments: overload(*arguments), "CUDA")
+
+
 def register_gradients(
-    op: str, backward: Callable, setup: Callable, *, gradient_ops: Sequence[str], without: Sequence[str] = ()
+    op: str,
+    backward: Callable,
+    setup: Callable,
+    *,
+    gradient_ops: Sequence[str] = (),
+    without: Sequence[str] = (),
+    jvp: Callable | None = None,
+    batched: Callable | None = None,
 ) -> None:
     """As torch.library.register_autograd, of gsim3d::``op``.
 
@@ -36,10 +53,87 @@ def register_gradients(
         setup: of torch.
         gradient_ops: what ``backward`` calls and what has no derivative itself.
         without: tensor arguments that have no gradient.
+        jvp: (inputs, their tangents or None, outputs) -> tangents of the outputs; :func:`call` then has forward mode.
+        batched: (size, inputs, is_batched) -> outputs with the batch in front, of inputs that have it in front where
+            ``is_batched``; :func:`call` then has ``torch.func``.
     """
     _register(op, op, Info(backward, setup), without)
+    if batched is not None:
+        _functions[op] = _function_of(op, backward, setup, jvp, batched)
     for name in gradient_ops:
         _register(name, op, Info(_second_derivative_of(op), None), ())
+
+
+def call(op: str, *arguments: Any) -> Any:
+    """What gsim3d::``op`` returns, also under the transforms of ``torch.func`` and in forward mode."""
+    transformed = torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0
+    if transformed and op in _functions and not torch.compiler.is_compiling():
+        return _functions[op].apply(*arguments)
+    return getattr(torch.ops.gsim3d, op)(*arguments)
+
+
+def _function_of(
+    op: str, backward: Callable, setup: Callable, jvp: Callable | None, batched: Callable
+) -> type[torch.autograd.Function]:
+    overload = getattr(torch.ops.gsim3d, op)
+
+    class Function(torch.autograd.Function):
+        @staticmethod
+        def forward(*inputs):
+            return overload(*inputs)
+
+        @staticmethod
+        def setup_context(ctx, inputs, output):
+            setup(ctx, inputs, output)
+            outputs = output if isinstance(output, tuple) else (output,)
+            ctx.is_tensor = [isinstance(x, Tensor) for x in inputs]
+            ctx.others = [x for x in inputs if not isinstance(x, Tensor)]
+            ctx.save_for_forward(*(x for x in (*inputs, *outputs) if isinstance(x, Tensor)))
+
+        @staticmethod
+        def jvp(ctx, *tangents):
+            if jvp is None:
+                raise GradientError(
+                    f"{op}: its gradient has no derivative in forward mode (jvp of a gradient); use reverse mode over "
+                    "reverse mode, as torch.func.jacrev",
+                    op=op,
+                    argument=None,
+                    order=2,
+                )
+            tensors, others = iter(ctx.saved_tensors), iter(ctx.others)
+            inputs = [next(tensors if is_tensor else others) for is_tensor in ctx.is_tensor]
+            return jvp(inputs, tangents, tuple(tensors))
+
+        @staticmethod
+        def vmap(info, in_dims, *inputs):
+            pairs = list(zip(inputs, in_dims, strict=True))
+            moved = [x if dim is None else x.movedim(dim, 0) for x, dim in pairs]
+            outputs = batched(info.batch_size, moved, [dim is not None for dim in in_dims])
+            return outputs, (0,) * len(outputs) if isinstance(outputs, tuple) else 0
+
+    Function.backward = staticmethod(backward)
+    Function.__name__ = Function.__qualname__ = op
+    return Function
+
+
+def one_by_one(op: str) -> Callable:
+    """The rule ``batched`` of an op that is called for each entry of the batch."""
+
+    def batched(size: int, inputs: Sequence[Any], is_batched: Sequence[bool]) -> Any:
+        rows = [[x[b] if has else x for x, has in zip(inputs, is_batched, strict=True)] for b in range(size)]
+        results = [call(op, *row) for row in rows]
+        if isinstance(results[0], tuple):
+            return tuple(map(torch.stack, zip(*results, strict=True)))
+        return torch.stack(results)
+
+    return batched
+
+
+def folded_segments(size: int, rows: Tensor, cu_rows: Tensor, n_rows: int) -> tuple[Tensor, Tensor]:
+    """Segments of ``size`` matrices of ``n_rows`` rows, one below the other; each has one more, of the rows in none."""
+    entry = torch.arange(size, device=rows.device)[:, None]
+    last = rows.new_full((1,), size * rows.shape[0])
+    return (rows + n_rows * entry).flatten(), torch.cat([(cu_rows + rows.shape[0] * entry).flatten(), last])
 
 
 def register_autocast(op: str, rule: str | Callable[[str, Sequence[Any]], Sequence[Any]]) -> None:

@@ -4,7 +4,8 @@ import torch
 from torch import Tensor
 
 from gsim3d.ops._arguments import check_numbers, check_real, check_tensors
-from gsim3d.ops._register import fake, register_autocast, register_gradients
+from gsim3d.ops._attention_derivatives import gradients_of_gradients, tangent
+from gsim3d.ops._register import alias, call, fake, one_by_one, register_autocast, register_gradients
 from gsim3d.ops.curve import PatchTable
 
 
@@ -29,7 +30,8 @@ def patch_attention(
     Returns:
         [Nq, H, D], dtype of ``q``.
     Gradients:
-        ``q``, ``k`` and ``v``, once.
+        ``q``, ``k`` and ``v``, to any order and in forward mode. Beyond the first order in reverse mode the scores of
+        all patches are stored.
     Determinism:
         equal bits for any number of threads, with AVX2 and AVX-512, on one GPU in every run, for any numbering
         of the rows, and with any other patches beside; only the order of the keys inside a patch rounds differently.
@@ -51,7 +53,7 @@ def patch_attention(
         check_tensors("patch_attention", q=q, k=k, v=v, **_lists(table))
         check_real("patch_attention", **({} if scale is None else {"scale": scale}))
         check_numbers("patch_attention", q=q, k=k, v=v)
-    return torch.ops.gsim3d.patch_attention(q, k, v, *_lists(table).values(), _scale(q, scale))[0]
+    return call("patch_attention", q, k, v, *_lists(table).values(), _scale(q, scale))[0]
 
 
 def joint_attention(
@@ -111,6 +113,11 @@ def _(q, k, v, q_rows, kv_rows, cu_q, cu_k, scale):
     return q.new_empty(q.shape), q.new_empty(q.shape[0], q.shape[1], 2, dtype=stats_dtype)
 
 
+# The same computation; what it returns there is not the whole gradient, so that it has none itself.
+alias("joint_attention_backward", of="patch_attention_backward")
+
+
+@fake("joint_attention_backward")
 @fake("patch_attention_backward")
 def _(grad, q, k, v, out, stats, q_rows, kv_rows, cu_q, cu_k, scale):
     return q.new_empty(q.shape), k.new_empty(k.shape), k.new_empty(k.shape)
@@ -131,8 +138,45 @@ def _setup(ctx, inputs, output):
 def _backward(ctx, grad, _grad_stats):
     if grad is None:
         return (None,) * 8
-    grads = torch.ops.gsim3d.patch_attention_backward(grad, *ctx.saved_tensors, ctx.scale)
+    grads = call("patch_attention_backward", grad, *ctx.saved_tensors, ctx.scale)
     return *grads, None, None, None, None, None
+
+
+def _jvp(inputs, tangents, outputs):
+    return tangent(*inputs[:3], *tangents[:3], inputs[3:7], inputs[7]), None
+
+
+def _gradient_setup(ctx, inputs, output):
+    grad, q, k, v, _, _, *lists, ctx.scale = inputs
+    ctx.save_for_backward(grad, q, k, v, *lists)
+
+
+def _gradient_backward(ctx, by_q, by_k, by_v):
+    grad, q, k, v, *lists = ctx.saved_tensors
+    return *gradients_of_gradients(grad, q, k, v, by_q, by_k, by_v, lists, ctx.scale), *(None,) * 7
+
+
+def _batched(op: str, n_floats: int):
+    """Patches of a batch one after another, where they share their table; else one by one."""
+
+    def batched(size, inputs, is_batched):
+        if any(is_batched[n_floats:]):
+            return one_by_one(op)(size, inputs, is_batched)
+        floats = [x if has else x.expand(size, *x.shape) for x, has in zip(inputs[:n_floats], is_batched)]
+        q, k = (floats[0], floats[1]) if n_floats == 3 else (floats[1], floats[2])
+        table = _one_after_another(size, *inputs[n_floats:-1], q.shape[1], k.shape[1])
+        results = call(op, *(x.flatten(0, 1) for x in floats), *table, inputs[-1])
+        return tuple(x.unflatten(0, (size, -1)) for x in results)
+
+    return batched
+
+
+def _one_after_another(size, q_rows, kv_rows, cu_q, cu_k, n_q, n_k):
+    """The table of ``size`` copies. Rows that no patch lists become a patch without keys, and one without queries."""
+    entry = torch.arange(size, device=q_rows.device)[:, None]
+    cu_q = torch.cat([cu_q, cu_q.new_full((1,), q_rows.shape[0])]) + q_rows.shape[0] * entry
+    cu_k = torch.cat([cu_k, cu_k[-1:]]) + kv_rows.shape[0] * entry
+    return (q_rows + n_q * entry).flatten(), (kv_rows + n_k * entry).flatten(), cu_q.flatten(), cu_k.flatten()
 
 
 @fake("joint_attention")
@@ -154,14 +198,23 @@ def _joint_backward(ctx, grad, _grad_stats):
     q, *keys, out, stats = ctx.saved_tensors
     # Each table's part of the gradient follows from its own keys and the result over both.
     own, other = (
-        torch.ops.gsim3d.patch_attention_backward(grad, q, *kv, out, stats, *lists, ctx.scale)
+        torch.ops.gsim3d.joint_attention_backward(grad, q, *kv, out, stats, *lists, ctx.scale)
         for kv, lists in ((keys[:2], keys[4:8]), (keys[2:4], keys[8:]))
     )
     return own[0] + other[0], *own[1:], *other[1:], *(None,) * 9
 
 
-_own_ops = ["patch_attention_backward", "patch_attention_backward_packed"]
-_rules = {"patch_attention": (_backward, _setup, _own_ops), "joint_attention": (_joint_backward, _joint_setup, [])}
-for _name, (_gradients, _context, _gradient_ops) in _rules.items():
-    register_gradients(_name, _gradients, _context, gradient_ops=_gradient_ops)
+register_gradients(
+    "patch_attention",
+    _backward,
+    _setup,
+    gradient_ops=["patch_attention_backward_packed"],
+    jvp=_jvp,
+    batched=_batched("patch_attention", 3),
+)
+register_gradients(
+    "patch_attention_backward", _gradient_backward, _gradient_setup, batched=_batched("patch_attention_backward", 6)
+)
+register_gradients("joint_attention", _joint_backward, _joint_setup, gradient_ops=["joint_attention_backward"])
+for _name in ("patch_attention", "joint_attention"):
     register_autocast(_name, "follow")

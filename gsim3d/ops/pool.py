@@ -2,9 +2,10 @@
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from gsim3d.ops._arguments import check_numbers, check_tensors, check_whole, within_memory
-from gsim3d.ops._register import fake, register_autocast, register_gradients
+from gsim3d.ops._register import call, fake, folded_segments, one_by_one, register_autocast, register_gradients
 
 
 def pool_max(x: Tensor, rows: Tensor, cu_rows: Tensor, *, check: bool = True) -> Tensor:
@@ -20,7 +21,7 @@ def pool_max(x: Tensor, rows: Tensor, cu_rows: Tensor, *, check: bool = True) ->
     Returns:
         [M, C], dtype of ``x``.
     Gradients:
-        ``x``, once; of equal maxima the one listed first receives it.
+        ``x``, to any order and in forward mode; of equal maxima the one listed first receives it.
     Raises:
         NumericalError: a number of ``x`` is not finite or beyond 1e15 (float64: 1e150); CPU only.
         ValueError, TypeError: an argument is malformed; the message names it. CUDA does not look into the index lists:
@@ -37,7 +38,7 @@ def pool_max(x: Tensor, rows: Tensor, cu_rows: Tensor, *, check: bool = True) ->
     if check:
         check_tensors("pool_max", x=x, rows=rows, cu_rows=cu_rows)
         check_numbers("pool_max", x=x)
-    return torch.ops.gsim3d.pool_max(x, rows, cu_rows)[0]
+    return call("pool_max", x, rows, cu_rows)[0]
 
 
 def pool_mean(x: Tensor, rows: Tensor, cu_rows: Tensor, *, check: bool = True) -> Tensor:
@@ -51,7 +52,7 @@ def pool_mean(x: Tensor, rows: Tensor, cu_rows: Tensor, *, check: bool = True) -
     Returns:
         [M, C], dtype of ``x``.
     Gradients:
-        ``x``, once.
+        ``x``, to any order and in forward mode.
     Raises:
         NumericalError, ValueError, TypeError: as :func:`pool_max`.
 
@@ -62,7 +63,7 @@ def pool_mean(x: Tensor, rows: Tensor, cu_rows: Tensor, *, check: bool = True) -
     if check:
         check_tensors("pool_mean", x=x, rows=rows, cu_rows=cu_rows)
         check_numbers("pool_mean", x=x)
-    return torch.ops.gsim3d.pool_mean(x, rows, cu_rows)
+    return call("pool_mean", x, rows, cu_rows)
 
 
 def unpool(x: Tensor, rows: Tensor, cu_rows: Tensor, n_rows: int, *, check: bool = True) -> Tensor:
@@ -75,7 +76,8 @@ def unpool(x: Tensor, rows: Tensor, cu_rows: Tensor, n_rows: int, *, check: bool
     Returns:
         [N, C]; rows that no segment lists are 0.
     Gradients:
-        ``x``, once; summed in the order of ``rows``, so equal bits for any number of threads.
+        ``x``, to any order and in forward mode; summed in the order of ``rows``, so equal bits for any number of
+        threads.
 
     Example:
         >>> unpool(torch.tensor([[7.0]]), torch.tensor([1, 0]), torch.tensor([0, 2]), 3)
@@ -87,8 +89,7 @@ def unpool(x: Tensor, rows: Tensor, cu_rows: Tensor, n_rows: int, *, check: bool
         check_tensors("unpool", x=x, rows=rows, cu_rows=cu_rows)
         check_whole("unpool", n_rows=n_rows)
         check_numbers("unpool", x=x)
-    kernel = torch.ops.gsim3d.unpool
-    return within_memory("unpool", f"n_rows={n_rows}", kernel, x, rows, cu_rows, n_rows)
+    return within_memory("unpool", f"n_rows={n_rows}", call, "unpool", x, rows, cu_rows, n_rows)
 
 
 @fake("pool_max")
@@ -122,6 +123,19 @@ def _(grad, rows, cu_rows):
     return grad.new_empty(cu_rows.shape[0] - 1, grad.shape[1])
 
 
+# Each op below is linear in its features, once the rows of maxima are known; a gradient is an op of this list again.
+
+
+def _first(x: Tensor, is_batched: bool, size: int) -> Tensor:
+    return x if is_batched else x.expand(size, *x.shape)
+
+
+def _setup_lists(ctx, inputs, output):
+    x, rows, cu_rows, *_ = inputs
+    ctx.save_for_backward(rows, cu_rows)
+    ctx.n_rows = x.shape[0]
+
+
 def _pool_max_setup(ctx, inputs, output):
     ctx.set_materialize_grads(False)
     ctx.save_for_backward(output[1])
@@ -132,29 +146,101 @@ def _pool_max_setup(ctx, inputs, output):
 def _pool_max_backward(ctx, grad, _grad_argmax):
     if grad is None:
         return None, None, None
-    return torch.ops.gsim3d.pool_max_backward(grad, ctx.saved_tensors[0], ctx.n_rows), None, None
+    return call("pool_max_backward", grad, ctx.saved_tensors[0], ctx.n_rows), None, None
 
 
-def _pool_mean_setup(ctx, inputs, output):
-    x, rows, cu_rows = inputs
-    ctx.save_for_backward(rows, cu_rows)
-    ctx.n_rows = x.shape[0]
+def _at_maxima(x: Tensor, argmax: Tensor) -> Tensor:
+    return torch.where(argmax < 0, 0, x.gather(0, argmax.clamp(min=0)) if x.shape[0] else 0)
 
 
-def _pool_mean_backward(ctx, grad):
-    return torch.ops.gsim3d.pool_mean_backward(grad, *ctx.saved_tensors, ctx.n_rows), None, None
+def _pool_max_jvp(inputs, tangents, outputs):
+    return None if tangents[0] is None else _at_maxima(tangents[0], outputs[1]), None
 
 
-def _unpool_setup(ctx, inputs, output):
-    ctx.save_for_backward(inputs[1], inputs[2])
+def _pool_max_gradient_setup(ctx, inputs, output):
+    ctx.save_for_backward(inputs[1])
+
+
+def _pool_max_gradient_backward(ctx, grad):
+    return _at_maxima(grad, ctx.saved_tensors[0]), None, None
+
+
+def _pool_max_gradient_batched(size, inputs, is_batched):
+    (grad, argmax), n_rows = map(_first, inputs[:2], is_batched, (size, size)), inputs[2]
+    first = n_rows * torch.arange(size, device=argmax.device)[:, None, None]
+    argmax = torch.where(argmax < 0, argmax, argmax + first)
+    grad_x = call("pool_max_backward", grad.flatten(0, 1), argmax.flatten(0, 1), size * n_rows)
+    return grad_x.unflatten(0, (size, n_rows))
+
+
+def _linear_jvp(op):
+    return lambda inputs, tangents, outputs: call(op, tangents[0], *inputs[1:])
+
+
+def _batched_lists(op, has_segments: bool, gives_segments: bool):
+    """Matrices in one call, one below the other. ``has_segments``, ``gives_segments``: x, out have a row a segment."""
+
+    def batched(size, inputs, is_batched):
+        if any(is_batched[1:]):
+            return one_by_one(op)(size, inputs, is_batched)
+        x, rows, cu_rows, *n_rows = inputs
+        n = n_rows[0] if n_rows else x.shape[1]
+        x = F.pad(x, (0, 0, 0, 1)) if has_segments else x
+        lists = folded_segments(size, rows, cu_rows, n)
+        result = call(op, x.flatten(0, 1), *lists, *(size * n for n in n_rows))
+        out = (result[0] if isinstance(result, tuple) else result).unflatten(0, (size, -1))
+        out = out[:, :-1] if gives_segments else out
+        if not isinstance(result, tuple):
+            return out
+        argmax = result[1].unflatten(0, (size, -1))[:, :-1]
+        first = n * torch.arange(size, device=rows.device)[:, None, None]
+        return out, torch.where(argmax < 0, argmax, argmax - first)
+
+    return batched
 
 
 def _unpool_backward(ctx, grad):
-    return torch.ops.gsim3d.unpool_backward(grad, *ctx.saved_tensors), None, None, None
+    return call("unpool_backward", grad, *ctx.saved_tensors), None, None, None
 
 
-register_gradients("pool_max", _pool_max_backward, _pool_max_setup, gradient_ops=["pool_max_backward"])
-register_gradients("pool_mean", _pool_mean_backward, _pool_mean_setup, gradient_ops=["pool_mean_backward"])
-register_gradients("unpool", _unpool_backward, _unpool_setup, gradient_ops=["unpool_backward"])
-for _op in ("pool_max", "pool_mean", "unpool"):
+def _segment_sum_backward(ctx, grad):
+    return call("unpool", grad, *ctx.saved_tensors, ctx.n_rows), None, None
+
+
+def _pool_mean_backward(ctx, grad):
+    return call("pool_mean_backward", grad, *ctx.saved_tensors, ctx.n_rows), None, None
+
+
+def _pool_mean_gradient_backward(ctx, grad):
+    return call("pool_mean", grad, *ctx.saved_tensors), None, None, None
+
+
+register_gradients(
+    "pool_max",
+    _pool_max_backward,
+    _pool_max_setup,
+    jvp=_pool_max_jvp,
+    batched=_batched_lists("pool_max", False, True),
+)
+register_gradients(
+    "pool_max_backward",
+    _pool_max_gradient_backward,
+    _pool_max_gradient_setup,
+    jvp=_linear_jvp("pool_max_backward"),
+    batched=_pool_max_gradient_batched,
+)
+for _op, _backward, _has_segments in (
+    ("pool_mean", _pool_mean_backward, False),
+    ("pool_mean_backward", _pool_mean_gradient_backward, True),
+    ("unpool", _unpool_backward, True),
+    ("unpool_backward", _segment_sum_backward, False),
+):
+    register_gradients(
+        _op,
+        _backward,
+        _setup_lists,
+        jvp=_linear_jvp(_op),
+        batched=_batched_lists(_op, _has_segments, not _has_segments),
+    )
+for _op in ("pool_max", "pool_mean", "unpool", "unpool_backward"):
     register_autocast(_op, "float32")

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.ops._arguments import check_numbers, check_tensors, check_whole
-from gsim3d.ops._register import fake, register_autocast, register_gradients
+from gsim3d.ops._register import call, fake, one_by_one, register_autocast, register_gradients
 from gsim3d.ops.curve import KernelMap, Voxels
 
 
@@ -38,7 +38,7 @@ def sparse_conv(
     Returns:
         [N, C_out], dtype of ``x``.
     Gradients:
-        ``x``, ``weight``, ``bias``, once.
+        ``x``, ``weight``, ``bias``, to any order and in forward mode.
     Determinism:
         the same bits for any number of threads, and in every run on CUDA. On the CPU an output is one chain of
         sums in the order of taps.
@@ -72,7 +72,8 @@ def sparse_conv(
         raise ValueError(
             f"sparse_conv: kernel_map must have the weight's kernel size {weight.shape[1]}; got {kernel_size}"
         )
-    return torch.ops.gsim3d.sparse_conv(
+    return call(
+        "sparse_conv",
         x,
         weight,
         bias,
@@ -123,15 +124,97 @@ def _backward(ctx, grad):
     needs_x, needs_weight, needs_bias = ctx.needs_input_grad[:3]
     grad_x = grad_weight = grad_bias = None
     if needs_x:
-        grad_x = torch.ops.gsim3d.sparse_conv_grad_input(grad, weight, *geometry, ctx.first, plan)
+        grad_x = call("sparse_conv_grad_input", grad, weight, *geometry, ctx.first, plan)
     if needs_weight or needs_bias:
         # Autograd wants the dtype of the parameters: rounded where they are written, without a pass over them.
-        grad_weight, grad_bias = torch.ops.gsim3d.sparse_conv_grad_weight(
-            grad, x, weight.shape[1], *geometry, ctx.first, True
-        )
+        grad_weight, grad_bias = call("sparse_conv_grad_weight", grad, x, weight.shape[1], *geometry, ctx.first, True)
     return grad_x, grad_weight, grad_bias if ctx.has_bias else None, *[None] * 8
 
 
-_gradient_ops = ["sparse_conv_grad_input", "sparse_conv_grad_weight"]
-register_gradients("sparse_conv", _backward, _setup, gradient_ops=_gradient_ops)
+# The convolution is linear in features and in weights, so its gradients are, and their gradients are convolutions.
+
+
+def _grad_input_setup(ctx, inputs, output):
+    grad, weight, *geometry, ctx.first, plan = inputs
+    ctx.save_for_backward(grad, weight, plan, *geometry)
+
+
+def _grad_input_backward(ctx, by_x):
+    grad, weight, plan, *geometry = ctx.saved_tensors
+    by_grad = by_weight = None
+    if ctx.needs_input_grad[0]:
+        by_grad = call("sparse_conv", by_x, weight, None, *geometry, ctx.first, plan)
+    if ctx.needs_input_grad[1]:
+        by_weight = call("sparse_conv_grad_weight", grad, by_x, weight.shape[1], *geometry, ctx.first, True)[0]
+    return by_grad, by_weight, *[None] * 8
+
+
+def _grad_weight_setup(ctx, inputs, output):
+    grad, x, _, *geometry, ctx.first, _ = inputs
+    ctx.save_for_backward(grad, x, *geometry)
+
+
+def _grad_weight_backward(ctx, by_weight, by_bias):
+    grad, x, *geometry = ctx.saved_tensors
+    by_weight, by_bias = by_weight.to(x.dtype), by_bias.to(x.dtype)
+    by_grad = by_x = None
+    if ctx.needs_input_grad[0]:
+        by_grad = call("sparse_conv", x, by_weight, by_bias, *geometry, ctx.first, None)
+    if ctx.needs_input_grad[1]:
+        by_x = call("sparse_conv_grad_input", grad, by_weight, *geometry, ctx.first, None)
+    return by_grad, by_x, *[None] * 9
+
+
+def _jvp(inputs, tangents, outputs):
+    (x, weight, _, *rest), (by_x, by_weight, by_bias, *_) = inputs, tangents
+    tangent = torch.zeros_like(outputs[0])
+    if by_x is not None:
+        tangent = tangent + call("sparse_conv", by_x, weight, None, *rest)
+    if by_weight is not None:
+        tangent = tangent + call("sparse_conv", x, by_weight, None, *rest)
+    return tangent if by_bias is None else tangent + by_bias
+
+
+def _batched(op: str, n_floats: int):
+    """Clouds of a batch beside each other where they share weights and geometry; else one by one."""
+
+    def batched(size, inputs, is_batched):
+        if not is_batched[0] or any(is_batched[1:]):
+            return one_by_one(op)(size, inputs, is_batched)
+        x, *weights = inputs[:n_floats]
+        geometry = _beside(size, *inputs[n_floats:-2])
+        return call(op, x.flatten(0, 1), *weights, *geometry, inputs[-2], None).unflatten(0, (size, -1))
+
+    return batched
+
+
+def _beside(size, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps):
+    """The geometry of ``size`` copies; pairs stay sorted by tap."""
+    n, n_voxels, entry = (
+        row_voxel.shape[0],
+        cu_voxel_rows.shape[0] - 1,
+        torch.arange(size, device=tap_in.device)[:, None],
+    )
+    tap = torch.searchsorted(cu_taps[1:], torch.arange(tap_in.shape[0], device=tap_in.device), right=True)
+    order = torch.argsort(tap.expand(size, -1).flatten(), stable=True)
+    return (
+        (row_voxel + n_voxels * entry).flatten(),
+        (voxel_rows + n * entry).flatten(),
+        torch.cat([(cu_voxel_rows[:-1] + n * entry).flatten(), size * cu_voxel_rows[-1:]]),
+        (tap_in + n_voxels * entry).flatten()[order],
+        (tap_out + n_voxels * entry).flatten()[order],
+        size * cu_taps,
+    )
+
+
+register_gradients("sparse_conv", _backward, _setup, jvp=_jvp, batched=_batched("sparse_conv", 3))
+register_gradients(
+    "sparse_conv_grad_input",
+    _grad_input_backward,
+    _grad_input_setup,
+    batched=_batched("sparse_conv_grad_input", 2),
+)
+register_gradients(
+    "sparse_conv_grad_weight", _grad_weight_backward, _grad_weight_setup, batched=one_by_one("sparse_conv_grad_weight")
+)
 register_autocast("sparse_conv", "follow")

@@ -1,0 +1,105 @@
+"""Higher derivatives and the transforms of torch.func, against finite differences and plain loops in float64."""
+
+import pytest
+import torch
+from torch.autograd import forward_ad, gradcheck, gradgradcheck
+
+from gsim3d import ops
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+ROWS, CU = torch.tensor([4, 0, 3, 1, 5, 2]), torch.tensor([0, 2, 2, 5])  # row 2 is in no segment, the second is empty
+TABLE = ops.PatchTable(ROWS, torch.tensor([0, 3, 3, 1, 2, 4]), CU, torch.tensor([0, 3, 4, 6]))
+
+
+def values(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def stage() -> ops.Stage:
+    spec = ops.PyramidSpec(0.4, 0, (), (), (4,), ((3,),))
+    zero, origin = torch.zeros(1, dtype=torch.int64), torch.zeros(1, 3, dtype=torch.float64)
+    return ops.build_pyramid(values(6, 3), torch.tensor([0, 6]), zero, zero, origin, spec).stages[0]
+
+
+STAGE = stage()
+CALLS = {
+    "pool_max": (lambda x: ops.pool_max(x, ROWS, CU), [values(6, 3)]),
+    "pool_mean": (lambda x: ops.pool_mean(x, ROWS, CU), [values(6, 3)]),
+    "unpool": (lambda x: ops.unpool(x, ROWS, CU, 6), [values(3, 3)]),
+    "sparse_conv": (
+        lambda x, w, b: ops.sparse_conv(x, w, b, STAGE.voxels, STAGE.kernel_maps[3]),
+        [values(6, 2), values(3, 3, 3, 3, 2), values(3)],
+    ),
+    "patch_attention": (
+        lambda q, k, v: ops.patch_attention(q, k, v, TABLE),
+        [values(6, 2, 4), values(5, 2, 4, seed=1), values(5, 2, 4, seed=2)],
+    ),
+}
+EVERY_OP = pytest.mark.parametrize(("function", "inputs"), CALLS.values(), ids=CALLS)
+
+
+def leaves(inputs):
+    return [x.clone().requires_grad_() for x in inputs]
+
+
+@EVERY_OP
+def test_second_derivatives_and_forward_mode_against_finite_differences(function, inputs):
+    assert gradcheck(function, leaves(inputs), check_forward_ad=True, check_batched_grad=True)
+    assert gradgradcheck(function, leaves(inputs))
+
+
+@EVERY_OP
+def test_third_derivatives_against_finite_differences(function, inputs):
+    def gradient(*xs):
+        return torch.autograd.grad(function(*xs).pow(3).sum(), xs, create_graph=True)
+
+    assert gradgradcheck(gradient, leaves(inputs), raise_exception=True, fast_mode=True)
+
+
+@EVERY_OP
+def test_transforms_equal_autograd(function, inputs):
+    def loss(*xs):
+        return function(*xs).pow(2).sum()
+
+    arguments = tuple(range(len(inputs)))
+    ours = torch.func.grad(loss, arguments)(*inputs)
+    xs = leaves(inputs)
+    for got, expected in zip(ours, torch.autograd.grad(loss(*xs), xs), strict=True):
+        torch.testing.assert_close(got, expected)
+    directions = tuple(torch.cos(9 * x) for x in inputs)
+    value, moved = torch.func.jvp(loss, tuple(inputs), directions)
+    torch.testing.assert_close(value, loss(*inputs))
+    torch.testing.assert_close(moved, sum((g * d).sum() for g, d in zip(ours, directions, strict=True)))
+    _, pull = torch.func.vjp(loss, *inputs)
+    for got, expected in zip(pull(torch.ones((), dtype=torch.float64)), ours, strict=True):
+        torch.testing.assert_close(got, expected)
+    with forward_ad.dual_level():
+        duals = [forward_ad.make_dual(x, d) for x, d in zip(inputs, directions, strict=True)]
+        torch.testing.assert_close(forward_ad.unpack_dual(loss(*duals)).tangent, moved)
+
+
+@EVERY_OP
+@pytest.mark.parametrize("of_all", [True, False], ids=["all batched", "first batched"])
+def test_vmap_equals_a_loop(function, inputs, of_all):
+    batch = [torch.stack([x, torch.sin(5 * x), x + 1]) for x in inputs]
+    dims = tuple(0 if of_all or i == 0 else None for i in range(len(inputs)))
+    arguments = [b if dim == 0 else x for b, x, dim in zip(batch, inputs, dims, strict=True)]
+    entries = [[x[b] if dim == 0 else x for x, dim in zip(arguments, dims, strict=True)] for b in range(3)]
+
+    def gradients(*xs):
+        return torch.func.grad(lambda *ys: function(*ys).pow(2).sum(), tuple(range(len(xs))))(*xs)
+
+    torch.testing.assert_close(torch.vmap(function, dims)(*arguments), torch.stack([function(*e) for e in entries]))
+    ours = torch.vmap(gradients, dims)(*arguments)
+    for got, *expected in zip(ours, *(gradients(*e) for e in entries), strict=True):
+        torch.testing.assert_close(got, torch.stack(expected))
+
+
+@EVERY_OP
+def test_hessian_by_reverse_over_reverse(function, inputs):
+    def loss(x):
+        return function(x, *inputs[1:]).pow(2).sum()
+
+    ours = torch.func.jacrev(torch.func.jacrev(loss))(inputs[0])
+    expected = torch.autograd.functional.hessian(loss, inputs[0])
+    torch.testing.assert_close(ours, expected)
