@@ -1,8 +1,8 @@
 """gsim3d learns 3D simulators from multi-view video.
 
-:class:`gsim3d.Simulator` is the learned simulator; the kernels (``gsim3d.rasterize_gaussians`` and the others of
-``gsim3d.ops``) are usable alone. Names load on first use, so ``gsim3d._core`` (the kernels on numpy arrays) works
-without torch.
+:class:`gsim3d.Simulator` is the learned simulator; the kernels of ``gsim3d.ops``, such as
+``gsim3d.rasterize_gaussians``, can be used on their own. Names are imported on first use, so that ``gsim3d._core`` (the
+kernels on numpy arrays) works without torch.
 """
 
 import importlib

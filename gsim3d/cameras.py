@@ -1,7 +1,7 @@
 """Cameras and Frames: calibrated images, the input of the simulator.
 
-Ragged: the images of many frames are packed one after another. Sizes: B scenes, Q clouds, I images, H W pixels.
-Units are metres and pixels; axes are OpenCV's (x right, y down, z forward).
+Images of any number of scenes, steps and views are packed along one dimension. Sizes: B scenes, Q clouds, I images,
+H x W pixels. Units are metres and pixels; axes are OpenCV's (x right, y down, z forward).
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from torch import Tensor
 
 
 class TensorRecord:
-    """Moves and selects all tensors of a dataclass together."""
+    """Base class of dataclasses of tensors, with operations on all of them."""
 
     def map(self, f: Callable[[Tensor], Tensor]) -> Self:
-        """The same object with ``f`` applied to every tensor."""
+        """Returns a copy with ``f`` applied to every tensor."""
         return dataclasses.replace(self, **{k: f(v) for k, v in vars(self).items() if isinstance(v, Tensor)})
 
     def to(self, device: str | torch.device) -> Self:
-        """The same on ``device``."""
+        """Returns a copy on ``device``."""
         return self.map(lambda t: t.to(device))
 
     def detach(self) -> Self:
-        """The same without gradients."""
+        """Returns a copy detached from the autograd graph."""
         return self.map(lambda t: t.detach() if t.is_floating_point() else t)
 
 
@@ -38,11 +38,11 @@ class Cameras(TensorRecord):
     Attributes:
         viewmats: [I, 4, 4] world-to-camera, OpenCV axes.
         Ks: [I, 3, 3] in pixels, full principal point, pixel centres at +0.5.
-        near: [I] metres, where the depth range of the scene begins.
-        far: [I] metres, where it ends.
+        near: [I] metres, near end of the scene's depth range.
+        far: [I] metres, far end of the scene's depth range.
         image_cloud: int64 [I], the cloud that each image shows.
-        width: pixels, the same for all images of one call.
-        height: pixels.
+        width: image width in pixels, equal for all images.
+        height: image height in pixels, equal for all images.
     """
 
     viewmats: Tensor
@@ -57,11 +57,11 @@ class Cameras(TensorRecord):
         return self.viewmats.shape[0]
 
     def select(self, images: Tensor, image_cloud: Tensor | None = None) -> Cameras:
-        """Some of the cameras.
+        """Returns a subset of the cameras.
 
         Args:
-            images: int64, which.
-            image_cloud: int64, clouds that they show; None: as before.
+            images: int64, indices of the cameras.
+            image_cloud: int64, clouds that they show. Default: unchanged.
         """
         return Cameras(
             self.viewmats[images],
@@ -80,14 +80,14 @@ class Frames(TensorRecord):
 
     Attributes:
         images: float32 [I, 3, H, W] in [0, 1].
-        cameras: of the I images; images of one cloud are its views, any number of them.
-        cloud_scene: int64 [Q]; clouds are sorted by (scene, step).
-        cloud_step: int64 [Q], steps of a scene count from 0.
-        origin: float64 [B, 3] metres, lower corner of each scene's workspace; voxels are counted from it.
+        cameras: cameras of the I images; the images of a cloud are its views.
+        cloud_scene: int64 [Q], scene of each cloud; clouds are sorted by (scene, step).
+        cloud_step: int64 [Q], step of each cloud, from 0.
+        origin: float64 [B, 3] metres, lower corner of each scene's workspace, and origin of its voxel grid.
         masks: bool [I, H, W], pixels that become particles; None: all.
-        dynamic: bool [I, H, W], pixels of bodies that may move; None: all.
-        valid: bool [I, H, W], pixels that were recorded: no padding; losses compare no others; None: all.
-        world_offset: float64 [B, 3] metres, as of Particles.
+        dynamic: bool [I, H, W], pixels of movable bodies; None: all.
+        valid: bool [I, H, W], pixels with recorded values (no padding), to which losses are restricted; None: all.
+        world_offset: float64 [B, 3] metres, see Particles.
     """
 
     images: Tensor
@@ -101,15 +101,15 @@ class Frames(TensorRecord):
     world_offset: Tensor | None = None
 
     def to(self, device: str | torch.device) -> Frames:
-        """The same on ``device``."""
+        """Returns a copy on ``device``."""
         return dataclasses.replace(super().to(device), cameras=self.cameras.to(device))
 
     def subsample(self, background_stride: int, body_stride: int) -> Frames:
-        """The same frames, of which every n-th row and column of pixels becomes particles.
+        """Returns frames with subsampled masks: only every n-th row and column of pixels becomes particles.
 
         Args:
-            background_stride: n of pixels that show what never moves.
-            body_stride: n of pixels that show what may move.
+            background_stride: n for pixels of static geometry.
+            body_stride: n for pixels of movable bodies.
         """
         if background_stride == body_stride == 1 or self.masks is None or self.dynamic is None:
             return self
@@ -118,7 +118,7 @@ class Frames(TensorRecord):
 
 
 def _every(stride: int, like: Tensor) -> Tensor:
-    """bool [H, W]: every n-th row and column of images [I, H, W]."""
+    """Returns bool [H, W] that selects every n-th row and column of images [I, H, W]."""
     chosen = torch.zeros(like.shape[1:], dtype=torch.bool, device=like.device)
     chosen[stride // 2 :: stride, stride // 2 :: stride] = True
     return chosen
@@ -126,18 +126,18 @@ def _every(stride: int, like: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class InputSpec:
-    """What a trained simulator takes as input: the steps, views and pixels that it was trained with.
+    """Input specification of a trained simulator: steps, views and pixels that it was trained with.
 
     Attributes:
-        history: steps that are encoded.
-        context_views: images of each step.
-        context_cameras: the cameras they come from; empty: all but ``target_only_cameras``.
+        history: number of input steps.
+        context_views: input images per step.
+        context_cameras: input cameras; empty: all but ``target_only_cameras``.
         target_only_cameras: cameras that are never an input.
-        background_stride: as of :meth:`Frames.subsample`.
-        body_stride: as of :meth:`Frames.subsample`.
-        image_size: (width, height) pixels.
-        near_far: metres, the depth range of all scenes; empty: each scene's own.
-        fps: frames per second; None: not known.
+        background_stride: see :meth:`Frames.subsample`.
+        body_stride: see :meth:`Frames.subsample`.
+        image_size: (width, height) in pixels.
+        near_far: depth range of all scenes in metres; empty: each scene's own.
+        fps: frames per second; None if unknown.
     """
 
     history: int = 2
@@ -152,13 +152,14 @@ class InputSpec:
 
 
 class FrameSource(Protocol):
-    """Anything that shows scenes to a simulator, such as :class:`gsim3d.data.Scene`."""
+    """Protocol of objects that provide input frames, such as :class:`gsim3d.data.Scene`."""
 
     def input_frames(self, inputs: InputSpec) -> Frames:
-        """Input images.
+        """Returns input frames for a simulator.
 
         Args:
-            inputs: of the simulator: how many steps and views, of which size.
+            inputs: input specification of the simulator.
+
         Returns:
-            The first ``inputs.history`` steps of one scene or several.
+            The first ``inputs.history`` steps of one or more scenes.
         """

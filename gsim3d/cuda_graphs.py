@@ -1,13 +1,12 @@
-"""CUDA graphs: a GPU runs all kernels of a rollout back to back, without Python and without waiting.
+"""Rollouts captured in CUDA graphs, which launch all kernels without Python overhead or synchronisation.
 
     with torch.autocast("cuda", torch.bfloat16):
         captured = CapturedRollout(simulator, state, 12, plan, cameras=cameras)
-    steps, renderings = captured(state)               # again and again, with other particles in as many rows
+    steps, renderings = captured(state)               # repeatedly, with other states of the same shapes
 
-A graph repeats the same kernels on the same memory, so that nothing in it may have a size that depends on particles:
-geometry is made with given sizes (:class:`gsim3d.ops.PyramidCapacity`), observed in a first rollout and multiplied by
-``factor``. Particles that need more are noticed by a flag that is read when the replay is over; the rollout is then
-captured anew with more capacity, and repeated.
+A graph replays the same kernels on the same memory, so no size in it may depend on values: geometry has a fixed
+capacity (:class:`gsim3d.ops.PyramidCapacity`), which is observed in a first rollout and multiplied by ``factor``. If
+particles exceed it, a flag read after the replay reports this, and the rollout is captured again with more capacity.
 """
 
 from __future__ import annotations
@@ -35,26 +34,27 @@ from gsim3d.ops.curve import Pyramid, PyramidCapacity
 from gsim3d.ops.raster import Rendering
 from gsim3d.state import DYNAMIC, CloudTable, Particles, keeping_constants, newest_clouds
 
-FACTOR = 1.25  # capacity over what was observed
-ROUNDED_PARTS = "dynamics", "renderer"  # of a simulator: what a rollout reads
-# In messages of errors for lack of memory: torch's, and those of ops, which say no more.
+FACTOR = 1.25  # capacity over the observed size
+ROUNDED_PARTS = "dynamics", "renderer"  # modules whose weights are cast for autocast
+# Substrings of out-of-memory messages of torch and of ops.
 OUT_OF_MEMORY = "out of memory", "DefaultCPUAllocator", "STATUS_ALLOC_FAILED", "aten::new_empty"
 
 
 class Captured:
-    """A function without arguments as a CUDA graph; calling it runs the graph and returns the same tensors each time.
+    """A function without arguments captured in a CUDA graph; a call replays it and returns the same tensors each time.
 
-    The function reads and writes the same memory in every replay: inputs are copied to where it reads them, results are
-    overwritten by the next call. It must not wait for the device, so the dynamics in it gets geometry of given sizes; a
-    backward pass (``torch.autograd.grad``) may be part of it. Autocast rounds weights anew in every replay.
+    Inputs must be copied into the tensors that the function reads; results are overwritten by the next call. The
+    function must not synchronise, so dynamics in it needs geometry of fixed capacity; it may contain a backward pass
+    (``torch.autograd.grad``). Under autocast every replay casts the weights again.
 
     Args:
-        function: is called twice before it is captured.
-        device: of all that it does.
-        pool: of torch.cuda.graph_pool_handle(), memory that graphs share which run one after another, and whose results
-            are not read once another of them has run; None: its own.
+        function: function to capture; called twice before, for warm-up.
+        device: device of the function.
+        pool: memory pool of torch.cuda.graph_pool_handle(), which may be shared by graphs that run one after another
+            and whose results are not used after another of them ran. Default: its own pool.
+
     Raises:
-        CaptureError: it cannot be captured; the message repeats CUDA's.
+        CaptureError: the function cannot be captured; the message contains CUDA's.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class Captured:
             raise CaptureError(f"Captured: device must be a GPU; got {device}")
         cached = torch.is_autocast_cache_enabled()
         torch.set_autocast_cache_enabled(False)
-        torch.clear_autocast_cache()  # what it holds was made on another stream, for which a backward pass would wait
+        torch.clear_autocast_cache()  # its tensors are of another stream, with which a backward pass would synchronise
         try:
             with torch.cuda.device(self._device), keeping_constants(self._constants):
                 self._capture(function, pool)
@@ -79,11 +79,11 @@ class Captured:
         side = torch.cuda.Stream()
         side.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(side):
-            for _ in range(2):  # kernels are loaded and constants made before the capture
+            for _ in range(2):  # warm-up: loads kernels and creates constants
                 function()
         torch.cuda.current_stream().wait_stream(side)
         self._graph = torch.cuda.CUDAGraph()
-        # What other threads do (one of NCCL asks the GPU what is done, at any time) must not end the capture.
+        # Calls of other threads, such as NCCL's watchdog, must not invalidate the capture.
         with collecting_nothing(), torch.cuda.graph(self._graph, pool=pool, capture_error_mode="thread_local"):
             self.result = function()
 
@@ -94,16 +94,16 @@ class Captured:
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether it was raised because memory was lacking."""
+    """Returns whether an error was caused by exhausted memory."""
     if isinstance(error, MemoryError) or any(text in str(error) for text in OUT_OF_MEMORY):
         return True
-    cause = error.__cause__ or error.__context__  # a capture that is broken off complains of that, too
+    cause = error.__cause__ or error.__context__  # an aborted capture raises another error on top
     return cause is not None and is_out_of_memory(cause)
 
 
 @contextlib.contextmanager
 def collecting_nothing() -> Iterator[None]:
-    """No garbage is collected inside: another graph that happens to be freed then would end a capture."""
+    """Context that disables garbage collection: freeing another graph would invalidate a capture."""
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -114,11 +114,11 @@ def collecting_nothing() -> Iterator[None]:
 
 
 class Prediction(NamedTuple):
-    """The steps of a rollout and their images.
+    """Predicted steps and their images.
 
     Attributes:
-        steps: particles of each predicted step, one cloud a scene.
-        renderings: images of each step; empty where no cameras were given.
+        steps: particles of each predicted step, with one cloud per scene.
+        renderings: images of each step; empty without cameras.
     """
 
     steps: list[Particles]
@@ -126,34 +126,35 @@ class Prediction(NamedTuple):
 
 
 class CapturedRollout:
-    """:meth:`Simulator.rollout`, and a rendering of every step, replayed from a CUDA graph. Without gradients.
+    """:meth:`Simulator.rollout` and rendering of every step as a CUDA graph, without gradients.
 
-    The graph belongs to the numbers of particles, scenes and steps of ``state``, to the plan, to autocast as it is when
-    the object is made, and to the model in evaluation. Under autocast the weights of matrix products and convolutions
-    are rounded once, into a copy: call :meth:`reload` after the model has changed. Else it reads the model's own.
+    A graph is specific to the shapes, scenes and steps of ``state``, the plan, the autocast state at construction, and
+    the model in evaluation mode. Under autocast, weights of matrix products and convolutions are cast once to a copy:
+    call :meth:`reload` after the model has changed. Otherwise the graph reads the model's weights.
 
-    With ``background="asymmetric"`` the graph advances the movable particles, as many in every call. The frozen context
-    is computed outside of the graph whenever it has changed (call :meth:`reload` after the model has); where it needs
-    more capacity the graph is captured anew. Particles do not sleep in a graph.
+    With ``background="asymmetric"``, the graph advances the movable particles, whose number must stay equal. The frozen
+    context is computed outside of the graph when it has changed (call :meth:`reload` after the model has changed). If
+    it exceeds its capacity, the graph is captured again. Sleep is not supported.
 
-    On the CPU there are no graphs: calls run the same steps one by one, with the same sizes and the same results.
+    On the CPU there are no graphs: calls run the steps eagerly, with the same capacities and the same results.
 
     Args:
         simulator: :class:`gsim3d.Simulator` in evaluation mode.
-        state: last steps of every scene; its clouds fix the numbers of particles.
-        n_steps: how many steps to predict.
-        plan: what to compute; default that of ``simulator.plan()``.
-        cameras: render these of every step, which has one cloud a scene.
-        background: of the images, [3] or [I, 3], default black.
-        factor: capacity of the geometry over what the rollout of ``state`` needs, at least 1.
-        copies: results are copies; False: the graph's own memory, which the next call overwrites.
-        report: counts numbers that cannot be used; default ``simulator.report``.
-        cutoff: of Gaussians, see :meth:`Simulator.render`.
+        state: last steps of every scene; fixes the number of particles of each cloud.
+        n_steps: number of steps to predict.
+        plan: plan of the effects. Default: ``simulator.plan()``.
+        cameras: cameras to render at every step; each step has one cloud per scene.
+        background: [3] or [I, 3], background colour. Default: black.
+        factor: capacity of the geometry over the size observed for ``state``, at least 1.
+        copies: return copies; False returns the graph's own memory, which the next call overwrites.
+        report: counts invalid numbers. Default: ``simulator.report``.
+        cutoff: see :meth:`Simulator.render`.
+
     Raises:
-        InputError: an argument does not fit; the message names it.
+        InputError: an argument is invalid; the message names it.
 
     Attributes:
-        captures: how often the graph was captured, 1 as long as the capacity sufficed.
+        captures: number of captures; 1 as long as the capacity sufficed.
     """
 
     def __init__(
@@ -177,14 +178,14 @@ class CapturedRollout:
         if not factor >= 1:
             raise InputError(f"CapturedRollout: factor must be at least 1; got {factor}")
         if cameras is not None and not simulator.draws_in_graphs:
-            raise InputError("CapturedRollout: this model draws outside of graphs only; leave cameras out")
+            raise InputError("CapturedRollout: this model cannot render in a graph; leave cameras out")
         self._simulator, self._n_steps, self._factor, self._copies = simulator, n_steps, factor, copies
         self._plan, self._drawn = plan or simulator.plan(), plan
         self._report = simulator.report if report is None else report
         self._report.poll()
         self._background, self._cutoff = background, cutoff
         if self._plan.spec.dynamics.sleep is not None:
-            raise InputError("CapturedRollout: plan must be one without dynamics.sleep: it is not part of a graph")
+            raise InputError("CapturedRollout: plan must not have dynamics.sleep, which a graph does not support")
         prepared = simulator._prepare(state, self._plan)
         self._table, self._state, self._frozen = prepared.clouds, _own(prepared), None
         self._cameras = None if cameras is None else cameras.map(torch.clone)
@@ -201,7 +202,7 @@ class CapturedRollout:
         if simulator.config.dynamics.is_asymmetric:
             parts = self._partition(prepared)
             if parts.nothing_moves:
-                raise InputError("CapturedRollout: state has no particle that moves; there is nothing to capture")
+                raise InputError("CapturedRollout: state has no movable particles")
             self._state = _own(parts.moving)
             own = Partition(_own(parts.newest), self._state, _own(parts.background), parts.rows.clone())
             self._frozen = _Frozen(own, self._remember(parts.background))
@@ -209,23 +210,23 @@ class CapturedRollout:
         self._resize(self._observed())
 
     def __call__(self, state: Particles, cameras: Cameras | None = None) -> Prediction:
-        """The rollout of ``state``, which has as many particles, scenes and steps as the first one.
+        """Returns the rollout of ``state``.
 
         Args:
-            state: steps may be numbered otherwise.
-            cameras: as many and as large as the first; default the last ones given.
+            state: state with as many particles, scenes and steps as the first one; step numbers may be shifted.
+            cameras: cameras of the same number and size as the first ones. Default: the last ones given.
+
         Raises:
-            InputError: ``state`` or ``cameras`` does not fit the graph.
+            InputError: ``state`` or ``cameras`` do not fit the graph.
         """
         self.launch(state, cameras)
         return self.finish()
 
     def launch(self, state: Particles, cameras: Cameras | None = None) -> None:
-        """Starts what :meth:`__call__` does and waits for nothing (except to leave out a masked background, and to
-        separate an asymmetric one).
+        """Starts :meth:`__call__` without synchronising, except for a masked-out or asymmetric background.
 
         Raises:
-            NumericalError: of an earlier call, under the policy "raise".
+            NumericalError: found in an earlier call, under the policy "raise".
         """
         state = self._simulator._prepare(state, self._plan)
         self._check(state, self._table)
@@ -238,10 +239,10 @@ class CapturedRollout:
         self._tables = tables
         self._launched = True
         self._replay()
-        self._report.poll()  # here the host reads while the device works
+        self._report.poll()  # host work that overlaps with the replay
 
     def finish(self) -> Prediction:
-        """Waits for what was launched; repeats it with more capacity where it did not fit."""
+        """Waits for the launched replay and returns its results; repeats it with more capacity if exceeded."""
         if not self._launched:
             raise InputError("CapturedRollout: finish() must follow launch()")
         self._launched = False
@@ -257,7 +258,7 @@ class CapturedRollout:
         return self._results()
 
     def reload(self) -> None:
-        """Reads the weights of the simulator again, and makes the background anew in the next call."""
+        """Reads the weights of the simulator again; the next call recomputes the frozen context."""
         self._is_stale = True
         if self._model is not self._simulator:
             for name in ROUNDED_PARTS:
@@ -266,7 +267,7 @@ class CapturedRollout:
     # ---- what runs ----
 
     def _rollout(self, geometry, report: StabilityReport) -> Prediction:
-        """The rollout of the graph's own state."""
+        """Computes the rollout of the graph's static state."""
         plan, frozen = of_prepared_state(self._plan), self._frozen
         options, renderings = {"geometry": geometry, "report": report}, []
         at_most = self._model.dynamics.moving_at_most(self._moving)
@@ -282,12 +283,12 @@ class CapturedRollout:
         return Prediction(steps, renderings)
 
     def _partition(self, prepared: Particles) -> Partition:
-        """Movable and frozen particles of a state, for a model with an asymmetric background."""
+        """Validates a state and splits it into movable and frozen particles."""
         validated = self._simulator._guard("rollout", None, self._report)(prepared)
         return Partition.of(validated, asymmetric=True)
 
     def _advance(self, context: FrozenContext, plan: Plan, geometry, report: StabilityReport) -> list[Particles]:
-        """The rollout of the movable particles alone."""
+        """Rolls out the movable particles with the frozen context."""
         guard = self._model._guard("rollout", None, report)
         options = {"plan": plan, "generator": None, "guard": guard, "geometry": geometry, "background": context}
         predict = functools.partial(self._model._predict, **options)
@@ -301,7 +302,7 @@ class CapturedRollout:
             return self._model.dynamics.remember(background).with_capacity(self._factor)
 
     def _observed(self) -> list[PyramidCapacity]:
-        """Capacities that the calls of the dynamics need; from a rollout that waits for every count."""
+        """Observes the capacities that the calls of the dynamics need, in a synchronising rollout."""
         needed = []
 
         def geometry(history: Particles) -> Pyramid:
@@ -313,7 +314,7 @@ class CapturedRollout:
         return needed
 
     def _count_moving(self) -> Tensor:
-        """int64 [1], largest number of movable particles of a scene of the graph's own state."""
+        """Returns int64 [1], the largest number of movable particles of a scene in the graph's state."""
         table, until = self._state.clouds, F.pad((self._state.activity == DYNAMIC).cumsum(0), (1, 0))
         counts = [until[table.starts[q + 1]] - until[table.starts[q]] for q in newest_clouds(table)]
         return torch.stack(counts).amax(0, keepdim=True)
@@ -325,7 +326,7 @@ class CapturedRollout:
         return all([capacity.fits(numbers) for capacity, numbers in zip(self._capacities, found, strict=True)])
 
     def _given(self, report: StabilityReport) -> tuple[Prediction, Tensor]:
-        """The rollout with the sizes of this object, and what the geometry of every call found."""
+        """Computes the rollout with the current capacities; also returns the sizes found by each geometry."""
         sizes, found = iter(self._capacities), []
 
         def geometry(history: Particles) -> Pyramid:
@@ -336,12 +337,12 @@ class CapturedRollout:
         return predicted, torch.stack([pyramid.found for pyramid in found])
 
     def _resize(self, capacities: list[PyramidCapacity]) -> None:
-        """Takes ``capacities`` as sizes and, on a GPU, makes the graph."""
+        """Sets the capacities and, on a GPU, captures the graph."""
         self._capacities, self._records = capacities, StabilityReport()
         self.captures += 1
         if self._device.type != "cuda":
             return
-        # their memory goes back before the next graph takes its own
+        # Free the memory of the previous graph before the new capture.
         self._graph = self._predicted = self._found = self._packed = None
         self._graph = Captured(self._capture, self._device)
         self._predicted, self._found, self._packed = self._graph.result
@@ -364,8 +365,7 @@ class CapturedRollout:
             self._arrived.record()
 
     def _arrive(self) -> tuple[list[list[int]], int, Tensor | None]:
-        """Waits for the replay: what the geometry of every call found, rows that may move, and what the
-        validation in the graph counted."""
+        """Waits for the replay; returns sizes found by each geometry, number of movable rows, validation counts."""
         if self._device.type != "cuda":
             return self._found.tolist(), int(self._count_moving()), None
         self._arrived.synchronize()
@@ -375,9 +375,9 @@ class CapturedRollout:
     # ---- what goes in and comes out ----
 
     def _load_parts(self, parts: Partition) -> Particles:
-        """Copies the frozen particles into the graph's memory; returns the movable ones."""
+        """Copies the frozen particles into the graph's memory; returns the movable particles."""
         own = self._frozen.partition
-        self._check(parts.moving, own.moving.clouds, " in what moves")
+        self._check(parts.moving, own.moving.clouds, " among movable particles")
         background = parts.background.row_fields()
         own_background = own.background.row_fields()
         changed = self._is_stale or not all(torch.equal(background[name], x) for name, x in own_background.items())
@@ -401,8 +401,8 @@ class CapturedRollout:
             )
         if _gaps(table) != _gaps(own):
             raise InputError(
-                f"CapturedRollout: state must have steps as far apart as the first one, {list(own.steps)}; "
-                f"got {list(table.steps)}"
+                f"CapturedRollout: state must have the same differences between steps as the first one, "
+                f"{list(own.steps)}; got {list(table.steps)}"
             )
         for name, value in self._state.row_fields().items():
             given, shape = getattr(state, name), (table.starts[-1], *value.shape[1:])
@@ -415,14 +415,14 @@ class CapturedRollout:
         if fixed != (len(cameras), cameras.width, cameras.height):
             wanted = "none" if own is None else "{} of {} x {} pixels".format(*fixed)
             raise InputError(
-                f"CapturedRollout: cameras must be those of the first call in number and size, {wanted}; "
+                f"CapturedRollout: cameras must have the number and size of the first ones, {wanted}; "
                 f"got {len(cameras)} of {cameras.width} x {cameras.height}"
             )
         for name in ("viewmats", "Ks", "near", "far", "image_cloud"):
             getattr(own, name).copy_(getattr(cameras, name))
 
     def _results(self) -> Prediction:
-        """The results with the step numbers of the state that was given."""
+        """Returns the results with the step numbers of the given state."""
         later = {s: given - own for s, given, own in zip(self._table.scenes, self._tables.steps, self._table.steps)}
         steps = []
         for step in self._predicted.steps:
@@ -439,7 +439,7 @@ class CapturedRollout:
 
 
 class _Frozen(NamedTuple):
-    """Frozen particles during the rollouts of a graph, in the graph's own memory."""
+    """Frozen particles of a graph, in its static memory."""
 
     partition: Partition
     context: FrozenContext
@@ -461,13 +461,13 @@ def _clones(fields: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _gaps(table: CloudTable) -> list[int | None]:
-    """Steps between each cloud and the one before it of the same scene."""
-    places = list(zip(table.scenes, table.steps))
-    return [b[1] - a[1] if a[0] == b[0] else None for a, b in zip(places, places[1:])]
+    """Returns the difference of steps between consecutive clouds; None between scenes."""
+    keys = list(zip(table.scenes, table.steps))
+    return [b[1] - a[1] if a[0] == b[0] else None for a, b in zip(keys, keys[1:])]
 
 
 def of_prepared_state(plan: Plan) -> Plan:
-    """``plan`` for a state that is prepared already."""
+    """Returns ``plan`` for a state to which its background mode was already applied."""
     if plan.spec.dynamics.background not in ("masked_out", "dynamic"):
         return plan
     dynamics = dataclasses.replace(plan.spec.dynamics, background="frozen")
@@ -475,9 +475,9 @@ def of_prepared_state(plan: Plan) -> Plan:
 
 
 def rounded(module: nn.Module, dtype: torch.dtype) -> nn.Module:
-    """A copy without gradients whose matrix products and convolutions hold what ``torch.autocast`` would round them to.
+    """Returns a copy without gradients, whose linear and convolution weights are cast as ``torch.autocast`` would.
 
-    Under autocast it computes the same numbers, and rounds no weights.
+    Under autocast it computes the same numbers without casting weights in every call.
     """
     module = copy.deepcopy(module).requires_grad_(False)
     for part in module.modules():

@@ -1,4 +1,4 @@
-"""Typed errors, which the command line turns into one line and exit code 2, and the checks that every module shares."""
+"""Typed errors, which the command line reports in one line with exit code 2, and shared checks."""
 
 from __future__ import annotations
 
@@ -8,18 +8,21 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-X86_64_V3 = {"avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe", "xsave"}  # as Linux names them
+X86_64_V3 = {"avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe", "xsave"}  # flags of /proc/cpuinfo
 
 
 class InputError(ValueError):
-    """A file, folder, option or argument is not what it must be; the message names it and says what to do."""
+    """Invalid file, folder, option or argument; the message names it and suggests a remedy."""
 
 
 class NumericalError(ValueError):
-    """Numbers that no op can use (NaN, Inf, out of range); the message names where they are and what to do.
+    """Invalid numbers (NaN, Inf, out of range); the message gives their location and suggests a remedy.
 
-    tensor: name of the tensor. scene, step: of the particle's cloud. row: of the packed rows of the call.
-    camera: image of the call. None where it is not known.
+    Attributes:
+        tensor: name of the tensor; None if unknown, as for the others.
+        scene, step: cloud of the particle.
+        row: index in the packed rows of the call.
+        camera: index of the image in the call.
     """
 
     def __init__(
@@ -37,13 +40,14 @@ class NumericalError(ValueError):
 
 
 class ProcessorError(ImportError):
-    """The processor lacks instructions that the compiled kernels use; the message names them."""
+    """The processor lacks instructions that the compiled kernels require; the message names them."""
 
 
 class CaptureError(RuntimeError):
-    """Something cannot be made a CUDA graph; the message says why.
+    """A function cannot be captured in a CUDA graph; the message gives the reason.
 
-    out_of_memory: whether memory was lacking.
+    Attributes:
+        out_of_memory: whether memory was exhausted.
     """
 
     def __init__(self, message: str, *, out_of_memory: bool = False):
@@ -52,13 +56,16 @@ class CaptureError(RuntimeError):
 
 
 class FitWarning(UserWarning):
-    """Data is changed to fit a model or a file format; the message says what is changed and how to keep it."""
+    """Data was changed to fit a model or a file format; the message says what was changed, and how to avoid it."""
 
 
 class GradientError(NotImplementedError):
-    """A derivative that an op does not have; the message names the op, the argument and the order.
+    """An unsupported derivative of an op; the message names op, argument and order.
 
-    argument: name of the argument that asked for it; None: any. order: 1, or 2 for the derivative of a gradient.
+    Attributes:
+        op: name of the op.
+        argument: argument that requires the gradient; None: any.
+        order: 1, or 2 for a derivative of a gradient.
     """
 
     def __init__(self, message: str, *, op: str, argument: str | None, order: int):
@@ -67,10 +74,10 @@ class GradientError(NotImplementedError):
 
 
 class RunStopped(RuntimeError):
-    """A run ended before its work was done: by a signal, or because its launcher or another process of it is gone; the
-    message says how to go on.
+    """A run was stopped by a signal, or by the loss of its launcher or another process; the message says how to resume.
 
-    code: exit code of the command; 128 and the signal's number where a signal ended it.
+    Attributes:
+        code: exit code of the command; 128 + number of the signal, if stopped by a signal.
     """
 
     def __init__(self, message: str, code: int = 2):
@@ -79,17 +86,17 @@ class RunStopped(RuntimeError):
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """The end of a message about an unknown ``name``: "; did you mean X?", or nothing where no known one is near."""
+    """Returns "; did you mean X?" with the known name closest to ``name``, or "" if none is close."""
     lower = {str(word).lower(): str(word) for word in known}
     near = difflib.get_close_matches(str(name)[:100].lower(), lower, 1)
     return f"; did you mean {lower[near[0]]}?" if near else ""
 
 
 def check_ranges(config: Any, **ranges: tuple[float, float]) -> None:
-    """Raises InputError where a number of ``config``, or one of a tuple of it, lies outside of its (least, most)."""
+    """Raises InputError if an attribute of ``config``, a number or tuple of numbers, is outside of its (min, max)."""
     for name, (least, most) in ranges.items():
         for value in _numbers(getattr(config, name)):
-            if not least <= value <= most:  # NaN does not, either
+            if not least <= value <= most:  # also rejects NaN
                 bound = f"at most {most}" if value > most else f"at least {least}"
                 raise InputError(f"{name} must be {bound}; got {value}")
 
@@ -103,7 +110,7 @@ def _numbers(value: Any) -> Iterator[float]:
 
 
 def check_processor(cpuinfo: Path = Path("/proc/cpuinfo")) -> None:
-    """Raises ProcessorError where the processor is known to lack an instruction of x86-64-v3."""
+    """Raises ProcessorError if the processor lacks an instruction of x86-64-v3."""
     if platform.machine() not in ("x86_64", "AMD64"):
         return
     try:

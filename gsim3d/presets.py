@@ -1,4 +1,4 @@
-"""Model sizes that are known to work: functions that return a ModelConfig."""
+"""Presets of model sizes: functions that return a ModelConfig."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from gsim3d.numerics.policy import StabilityConfig
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """The three parts of a simulator, which must agree on the particles that pass between them, and their limits.
+    """Configuration of a simulator; its parts must agree on the attributes of particles.
 
     Attributes:
         encoder: images to particles.
         dynamics: particles to particles of the next step.
         renderer: particles to Gaussians.
-        stability: limits, and what happens beyond them.
+        stability: numerical limits and policy.
     """
 
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
@@ -43,7 +43,7 @@ class ModelConfig:
 
 
 def tiny() -> ModelConfig:
-    """Trains on two CPU cores in minutes: 64-pixel images, scenes of about a metre, up to 2 steps of history."""
+    """Smallest model, trains on two CPU cores in minutes: 64-pixel images, scenes of about 1 m, history up to 2."""
     encoder = EncoderConfig.tiny()
     return ModelConfig(
         encoder=encoder,
@@ -81,7 +81,7 @@ def tiny() -> ModelConfig:
 
 
 def small() -> ModelConfig:
-    """About 4 million parameters, 128-pixel images, up to 4 steps of history: a day on one GPU."""
+    """Model of about 4 million parameters, trains in a day on one GPU: 128-pixel images, history up to 4."""
     encoder = EncoderConfig(
         feature_dim=64,
         cnn_dims=(32, 48, 64),
@@ -121,9 +121,11 @@ def small() -> ModelConfig:
 
 
 def paper_latent(n_steps: int = 4, latents: int = 32) -> ModelConfig:
-    """The latent model of the paper for a history of ``n_steps``: 1, 2, 4 or 8.
+    """The latent model of the paper.
 
-    latents: channels that change with time, and as many that do not; 32 in the paper, 64 in the published settings.
+    Args:
+        n_steps: history, 1, 2, 4 or 8.
+        latents: number of dynamic latents, and of static latents; 32 in the paper, 64 in the published settings.
     """
     return ModelConfig(
         encoder=EncoderConfig(dynamic_dim=latents, static_dim=latents),
@@ -133,9 +135,11 @@ def paper_latent(n_steps: int = 4, latents: int = 32) -> ModelConfig:
 
 
 def paper_explicit(n_steps: int = 4, static_latents: int = 16) -> ModelConfig:
-    """The explicit model of the paper for a history of ``n_steps``: all Gaussian parameters change with time.
+    """The explicit model of the paper, which predicts all Gaussian parameters.
 
-    static_latents: channels beside them; 16 in the paper, none in the published settings.
+    Args:
+        n_steps: history, 1, 2, 4 or 8.
+        static_latents: number of static latents; 16 in the paper, 0 in the published settings.
     """
     return ModelConfig(
         encoder=EncoderConfig(dynamic_dim=0, static_dim=static_latents, explicit=True),

@@ -1,16 +1,16 @@
-"""The simulator: images -> particles -> particles of later steps -> images. The file to read first.
+"""The simulator: images -> particles -> particles of later steps -> images. Start reading the library here.
 
     simulator = Simulator.from_pretrained("elastic-small")
     state = simulator.encode(frames)                  # particles of the last steps of every scene
-    plan = simulator.plan(EffectsSpec())              # what to compute, and what not
+    plan = simulator.plan(EffectsSpec())              # which effects to compute
     steps = simulator.rollout(state, 12, plan)        # particles of the next 12 steps
-    images = simulator.render(steps[-1], cameras)     # any camera, pixels and depth
+    images = simulator.render(steps[-1], cameras)     # colours and depth from any camera
 
-A state holds the last steps of each scene (:class:`gsim3d.state.Particles`, clouds sorted by scene and step). Scenes
-are packed, not padded: particle counts, numbers of views and lengths of history may all differ.
+A state contains the last steps of each scene (:class:`gsim3d.state.Particles`, clouds sorted by scene and step). Scenes
+are packed, not padded: numbers of particles, views and history steps may differ between scenes.
 
-Every call takes ``on_invalid``, the policy for numbers that cannot be used (:mod:`gsim3d.numerics.policy`; default the
-model's), and ``report``, which counts them (default ``simulator.report``).
+Every method takes ``on_invalid``, the policy for invalid numbers (:mod:`gsim3d.numerics.policy`; default: the model's),
+and ``report``, which counts them (default: ``simulator.report``).
 """
 
 from __future__ import annotations
@@ -58,16 +58,16 @@ from gsim3d.state import DYNAMIC, FROZEN, Gaussians, Particles
 
 
 class Simulator(nn.Module):
-    """Encoder, dynamics and renderer of one model.
+    """The learned simulator: encoder, dynamics and renderer.
 
     Attributes:
-        config: sizes of its parts.
-        effects: what it was trained to simulate, the default of :meth:`plan`.
-        inputs: what it was trained on; None: not known.
-        setting: how :meth:`predict` computes.
-        report: StabilityReport of the calls that were given no other.
-        absent: parameters that the weights it was given lack; plans that read them are refused.
-        draws_in_graphs: whether images can be part of a CUDA graph.
+        config: model configuration.
+        effects: effects that the model was trained to simulate, the default of :meth:`plan`.
+        inputs: input specification of the training; None if unknown.
+        setting: speed setting of :meth:`predict`.
+        report: default StabilityReport of all methods.
+        absent: names of parameters missing in the loaded weights; plans that use them raise an error.
+        draws_in_graphs: whether rendering can be captured in a CUDA graph.
     """
 
     config_class: type[ModelConfig] = ModelConfig
@@ -85,30 +85,34 @@ class Simulator(nn.Module):
 
     @classmethod
     def from_pretrained(cls, name_or_path: str | Path, *, device: str = "cpu", speed: str = "exact") -> Simulator:
-        """A trained simulator, ready to predict.
+        """Loads a trained simulator.
 
         Args:
-            name_or_path: name of a simulator that comes with gsim3d (:func:`gsim3d.pretrained.names`), a run folder, a
-                checkpoint folder or a .safetensors file.
+            name_or_path: name of a shipped simulator (:func:`gsim3d.pretrained.names`), run folder, checkpoint folder
+                or .safetensors file.
             device: "cpu" or "cuda".
-            speed: "exact", or "balanced" or "fast" where ``gsim3d profile`` tuned them for the checkpoint.
+            speed: "exact", or "balanced" or "fast" if ``gsim3d profile`` tuned them for the checkpoint.
+
         Returns:
-            The simulator, in evaluation mode.
+            The simulator in evaluation mode.
+
         Raises:
-            InputError: there is no such checkpoint, it is broken or one of the published model, ``device`` is not
-                there, or ``speed`` was not tuned; the message says what to do.
+            InputError: the checkpoint does not exist, is damaged or is of the published model, ``device`` is not
+                available, or ``speed`` was not tuned.
         """
         return loading.load((cls,), name_or_path, device, speed)[0]
 
     def save_pretrained(self, folder: str | Path) -> Path:
-        """Writes weights and configuration, for :meth:`from_pretrained`.
+        """Saves weights and configuration, to be loaded with :meth:`from_pretrained`.
 
         Args:
-            folder: is made, or replaced where it is a checkpoint.
+            folder: folder to create; an existing checkpoint is replaced.
+
         Returns:
             The folder.
+
         Raises:
-            InputError: there is something else at this path; nothing is written.
+            InputError: the path exists and is not a checkpoint; nothing is written.
             NumericalError: a weight is not finite; nothing is written.
         """
         return loading.save(self, Path(folder))
@@ -126,23 +130,24 @@ class Simulator(nn.Module):
         wrap: Callable[[Callable], Callable] | None = None,
         log: RestLog | None = None,
     ) -> Prediction:
-        """The future of scenes: :meth:`encode`, :meth:`rollout` and :meth:`render` as the simulator's ``setting`` says.
+        """Predicts future steps of scenes: :meth:`encode`, :meth:`rollout` and :meth:`render` with ``self.setting``.
 
         Args:
-            source: input images, or anything that gives them: :class:`gsim3d.data.Scene`, or an own class with a method
-                ``input_frames(inputs)`` (:class:`gsim3d.cameras.FrameSource`), or particles that are encoded.
-            steps: how many to predict, at least 1.
-            plan: what to compute; None: that of :meth:`plan`, with particles inserted and removed as ``edits`` do.
-            cameras: of the images of each step; None: none are drawn.
-            background: [3] or [I, 3], of the images; default black.
-            edits: changes of the scene on the way.
-            wrap: as of :meth:`rollout`; not called where the setting replays a CUDA graph.
-            log: as of :meth:`rollout`.
+            source: input frames, an object that provides them (:class:`gsim3d.cameras.FrameSource`, such as
+                :class:`gsim3d.data.Scene`), or encoded particles.
+            steps: number of steps to predict, at least 1.
+            plan: plan of the effects. Default: that of :meth:`plan`, extended by the structural changes of ``edits``.
+            cameras: cameras to render at every step. Default: no rendering.
+            background: [3] or [I, 3], background colour. Default: black.
+            edits: edits to apply during the rollout.
+            wrap: see :meth:`rollout`; not called if the setting replays a CUDA graph.
+            log: see :meth:`rollout`.
+
         Returns:
             Particles of the steps after the last input step, and their images.
+
         Raises:
-            InputError: ``steps`` is below 1, the images have another size than those of the training, or an edit cannot
-                be made.
+            InputError: ``steps`` is below 1, the image size differs from the training's, or an edit is invalid.
         """
         if plan is None:
             plan = self.plan(dataclasses.replace(self.effects, structure=structure_of(edits)))
@@ -156,17 +161,20 @@ class Simulator(nn.Module):
         report: StabilityReport | None = None,
         shapes: StaticShapes | None = None,
     ) -> Particles:
-        """Particles of all clouds of ``frames``: each pixel inside the masks becomes one.
+        """Encodes frames to particles, one for each pixel inside the masks.
 
         Args:
-            frames: input images.
-            on_invalid: policy for numbers that cannot be used; None: the model's.
-            report: counts such numbers; None: ``self.report``.
-            shapes: of :meth:`gsim3d.nn.multiview_encoder.Encoder.static_shapes`: nothing then waits for the device.
+            frames: input frames.
+            on_invalid: policy for invalid numbers. Default: the model's.
+            report: counts invalid numbers. Default: ``self.report``.
+            shapes: result of :meth:`gsim3d.nn.multiview_encoder.Encoder.static_shapes`, which avoids synchronisation
+                with the device.
+
         Returns:
-            The particles, cloud by cloud.
+            Particles, packed by cloud.
+
         Raises:
-            InputError, NumericalError: ``frames`` cannot be read; the message names the field and where.
+            InputError, NumericalError: ``frames`` are invalid; the message names the field and location.
         """
         guard = self._guard("encode", on_invalid, report)
         config = guard.keywords["config"]
@@ -183,21 +191,23 @@ class Simulator(nn.Module):
         return particles
 
     def plan(self, spec: EffectsSpec | None = None) -> Plan:
-        """What will be computed, and what will not.
+        """Compiles an effects specification to a plan of the required computations.
 
         Args:
-            spec: what the scene calls for; None: what the model was trained to simulate.
+            spec: effects to simulate. Default: those that the model was trained for.
+
         Returns:
-            The plan, which :meth:`step`, :meth:`rollout` and :meth:`render` take.
+            The plan, an argument of :meth:`step`, :meth:`rollout` and :meth:`render`.
+
         Raises:
-            UnsupportedEffect: this model cannot simulate an effect of ``spec``.
+            UnsupportedEffect: the model does not support an effect of ``spec``.
         """
         plan = make_plan(self.effects if spec is None else spec, self.config)
         names = (name for name, _ in self.named_parameters())
         unused = unused_parameters(plan, self.config, names)
         if needed := sorted(self.absent.difference(unused)):
             raise UnsupportedEffect(
-                f"unsupported effects: they read {', '.join(needed)}, which the weights do not have"
+                f"unsupported effects: they require {', '.join(needed)}, which the weights do not contain"
             )
         return dataclasses.replace(plan, unused=unused)
 
@@ -210,16 +220,18 @@ class Simulator(nn.Module):
         on_invalid: OnInvalid | None = None,
         report: StabilityReport | None = None,
     ) -> Particles:
-        """The state one call of the dynamics later: each scene's oldest steps leave once the history is full.
+        """Advances the state by one call of the dynamics; drops the oldest steps once the history is full.
 
         Args:
             state: last steps of every scene.
-            plan: what to compute; None: that of :meth:`plan`. No particle sleeps: that is decided along a rollout.
-            generator: randomness of training (drop path, curve shuffling); None: none.
-            on_invalid: policy for numbers that cannot be used; None: the model's.
-            report: counts such numbers; None: ``self.report``.
+            plan: plan of the effects. Default: that of :meth:`plan`. Particles are never put to sleep, because that is
+                decided along a rollout.
+            generator: random generator for training (drop path, curve shuffling). Default: no randomness.
+            on_invalid: policy for invalid numbers. Default: the model's.
+            report: counts invalid numbers. Default: ``self.report``.
+
         Returns:
-            The last steps of every scene, the new one included.
+            The last steps of every scene, including the new one.
         """
         plan, guard = plan or self.plan(), self._guard("step", on_invalid, report)
         self._check(state, "step")
@@ -244,29 +256,32 @@ class Simulator(nn.Module):
         edits: Iterable[Edit] = (),
         actors: Sequence[Actor] = (),
     ) -> list[Particles]:
-        """The next ``n_steps`` steps, one :class:`Particles` each with one cloud a scene.
+        """Predicts the next ``n_steps`` steps.
 
-        The particles are those of the newest step of ``state`` throughout, but for edits.
+        Except for edits, all steps have the particles of the newest step of ``state``, in the same order.
 
         Args:
             state: last steps of every scene.
-            n_steps: how many to predict.
-            plan: as of :meth:`step`.
-            plans: one for each scene, in place of ``plan``; each scene is computed as if it were alone, those with
-                equal plans together.
-            generator: as of :meth:`step`.
-            on_invalid: policy for numbers that cannot be used; None: the model's.
-            report: counts such numbers; None: ``self.report``.
-            geometry: makes the geometry of each call of the dynamics from its history; None: ``dynamics.geometry``.
-            wrap: the function that predicts the next steps from a history -> the one to call instead; None: that one.
-            log: records which particles rested and were not computed.
-            edits: changes of the scene on the way (:mod:`gsim3d.effects.edits`); they wake all particles.
-            actors: particles that move as prescribed (:mod:`gsim3d.effects.actors`).
+            n_steps: number of steps to predict.
+            plan: see :meth:`step`.
+            plans: one plan per scene, instead of ``plan``. Scenes with equal plans are batched; each result equals that
+                of the scene alone.
+            generator: see :meth:`step`.
+            on_invalid: policy for invalid numbers. Default: the model's.
+            report: counts invalid numbers. Default: ``self.report``.
+            geometry: function history -> geometry of a call of the dynamics. Default: ``dynamics.geometry``.
+            wrap: decorator of the function history -> next steps. Default: none.
+            log: records which particles were at rest and skipped.
+            edits: edits to apply during the rollout (:mod:`gsim3d.effects.edits`); they wake all particles.
+            actors: kinematic particles that move as prescribed (:mod:`gsim3d.effects.actors`).
+
         Returns:
-            Particles of each step.
+            Particles of each step, with one cloud per scene.
+
         Raises:
-            InputError: an edit cannot be made, and the message names its step and operation; ``plans`` are not as many
-                as scenes; or actors cannot move as prescribed.
+            InputError: an edit or actor is invalid (the message names its step and operation), or the number of
+                ``plans`` is not that of the scenes.
+
         Gradients:
             through all steps, also to displacements of actors.
         """
@@ -309,7 +324,7 @@ class Simulator(nn.Module):
         return Actors(actors, state, n_steps)
 
     def _roll(self, predict, state: Particles, n_steps: int, plan: Plan, generator, log) -> list[Particles]:
-        """:meth:`rollout` of a state that is prepared, without edits."""
+        """Rolls out a prepared state, without edits."""
         config, rule, sleepers = self.config.dynamics, plan.spec.dynamics.sleep, None
         if rule is None and not config.is_asymmetric:
             return rollout(predict, state, n_steps, plan.history)
@@ -327,8 +342,8 @@ class Simulator(nn.Module):
         )
 
     def _prepare(self, state: Particles, plan: Plan) -> Particles:
-        """What the dynamics reads of ``state``: its last steps, with the background as the plan wants it, and marks on
-        the bodies that it names."""
+        """Prepares ``state`` for the dynamics: trims it to the history, and applies the plan's background mode and
+        selections of frozen appearance."""
         background, appearance = plan.spec.dynamics.background, plan.spec.appearance
         selections = () if appearance.changing == "none" else appearance.frozen_appearance
         if not selections and state.frozen_appearance is not None:
@@ -355,21 +370,24 @@ class Simulator(nn.Module):
         on_invalid: OnInvalid | None = None,
         report: StabilityReport | None = None,
     ) -> Rendering:
-        """Images of ``cameras``; camera i shows cloud ``cameras.image_cloud[i]`` of ``particles``.
+        """Renders images; camera i shows cloud ``cameras.image_cloud[i]`` of ``particles``.
 
         Args:
-            particles: any clouds.
-            cameras: I images.
-            background: [3] or [I, 3], default black.
-            plan: which images, and the degree of view-dependent colour; default colour as the model's, alpha and depth.
-            plans: one for each scene, in place of ``plan``; all for the same outputs.
-            cutoff: as :func:`gsim3d.ops.rasterize_gaussians`.
-            on_invalid: policy for numbers that cannot be used; None: the model's.
-            report: counts such numbers; None: ``self.report``.
+            particles: particles of any clouds.
+            cameras: cameras of I images.
+            background: [3] or [I, 3], background colour. Default: black.
+            plan: selects the outputs and the degree of view-dependent colour. Default: colour, alpha and depth, at the
+                model's degree.
+            plans: one plan per scene, instead of ``plan``, all with the same outputs.
+            cutoff: see :func:`gsim3d.ops.rasterize_gaussians`.
+            on_invalid: policy for invalid numbers. Default: the model's.
+            report: counts invalid numbers. Default: ``self.report``.
+
         Returns:
-            The images that the plan asks for.
+            The outputs selected by the plan.
+
         Raises:
-            InputError: ``plans`` are not as many as scenes, or ask for different images.
+            InputError: the number of ``plans`` is not that of the scenes, or their outputs differ.
         """
         if plans is not None:
             options = {"cutoff": cutoff, "on_invalid": on_invalid, "report": report}
@@ -393,7 +411,7 @@ class Simulator(nn.Module):
         on_invalid: OnInvalid | None = None,
         report: StabilityReport | None = None,
     ) -> Rendering:
-        """As :meth:`render`, of particles as :meth:`rollout` returned them: their numbers are not looked at again."""
+        """Renders like :meth:`render`, without validating ``particles``."""
         on_invalid, report = on_invalid or self.config.stability.on_invalid, self.report if report is None else report
         outputs = plan.spec.outputs if plan else OutputEffects(depth=True, alpha=True)
         gaussians = self.renderer(particles, sh_degree=plan.sh_degree if plan else None, rgb=outputs.rgb)
@@ -414,7 +432,7 @@ class Simulator(nn.Module):
         self, particles: Particles, cameras: Cameras, background: Tensor | None, plans: Sequence[Plan], **options
     ) -> Rendering:
         if len({plan.spec.outputs for plan in plans}) > 1:
-            raise InputError("plans: those of one batch must ask for the same images (outputs)")
+            raise InputError("plans: must have equal outputs")
         shown, order, images = cameras.image_cloud.tolist(), [], []
         for plan, clouds in by_plan(particles, plans):
             rows = [i for i, cloud in enumerate(shown) if cloud in clouds]
@@ -432,16 +450,16 @@ class Simulator(nn.Module):
         return render(gaussians, cameras, background, **options)
 
     def _changes(self, plan: Plan) -> dict[str, str]:
-        """Of each field that the dynamics predicts, whose values a step changes."""
+        """Returns predicted attribute -> which particles a step changes ("all", "dynamic", "none")."""
         appearance = plan.spec.appearance
         return self.dynamics.layout.changes(appearance.changing, appearance.opacity_changes is not False)
 
     def _colors(self, particles: Particles) -> Tensor:
-        """[N, 3], of the Gaussians, seen from nowhere in particular."""
+        """Returns the view-independent colours [N, 3] of the Gaussians."""
         return 0.5 + SH_0 * self.renderer(particles, sh_degree=0).sh[:, 0]
 
     def _check(self, particles: Particles, where: str) -> None:
-        """Raises where fields of ``particles`` are not what they must be."""
+        """Raises InputError if shapes or dtypes of ``particles`` are wrong."""
         config = self.config.dynamics
         widths = {"dynamic_latents": config.dynamic_latents, "static_latents": config.static_latents}
         check_particles(particles, where, next(self.parameters()).dtype, widths)
@@ -449,7 +467,7 @@ class Simulator(nn.Module):
     def _guard(
         self, where: str, on_invalid: OnInvalid | None, report: StabilityReport | None, in_workspace: bool = True
     ) -> partial[Particles]:
-        """validate_particles with the limits of this model."""
+        """Returns validate_particles with the limits of this model."""
         limits, dynamics = self.config.stability, self.config.dynamics
         if on_invalid is not None:
             check_on_invalid(on_invalid)
@@ -475,9 +493,13 @@ class Simulator(nn.Module):
         guard: Callable[..., Particles],
         geometry: Callable[[Particles], Pyramid] | None = None,
     ) -> Particles:
-        """The next steps of every scene, guarded.
+        """Predicts and validates the next steps of every scene.
 
-        background: what rests while ``state`` moves; None: all there is, is in the state.
+        Args:
+            state: last steps of every scene.
+            background: context of frozen and sleeping particles; None if ``state`` contains all particles.
+            plan, generator, geometry: see :meth:`rollout`.
+            guard: validates the result.
         """
         changes = self._changes(plan)
         pyramid = None if geometry is None else geometry(state)

@@ -1,8 +1,8 @@
 """Particles and Gaussians: the state of a simulation.
 
-Both are ragged: particles of many clouds (a cloud is one scene at one time step) are packed one after another, and
-``cu_rows`` holds where each cloud starts. Sizes: B scenes, Q clouds, I images, N particles, C channels, H W pixels.
-Units are metres and pixels; axes are OpenCV's (x right, y down, z forward); quaternions are (w, x, y, z).
+Both are packed: particles of many clouds (a cloud is a scene at a time step) are concatenated, and ``cu_rows`` contains
+the offset of each cloud. Sizes: B scenes, Q clouds, I images, N particles, C channels, H x W pixels. Units are metres
+and pixels; axes are OpenCV's (x right, y down, z forward); quaternions are (w, x, y, z).
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ _stores: list[dict[tuple, Tensor]] = []
 
 
 def constant(values: tuple[int, ...], device: torch.device) -> Tensor:
-    """int64 tensor of ``values``, the same object at every call: read it, never write to it.
+    """Returns a cached int64 tensor of ``values``, which must not be modified.
 
-    A step that repeats sends nothing to the device, and can be captured in a CUDA graph.
+    The cache avoids host-to-device copies in repeated steps, so that they can be captured in a CUDA graph.
     """
     if torch.compiler.is_compiling():
         return torch.tensor(values, dtype=torch.int64, device=device)
@@ -49,7 +49,7 @@ def constant(values: tuple[int, ...], device: torch.device) -> Tensor:
 
 @contextlib.contextmanager
 def keeping_constants(store: dict[tuple, Tensor]) -> Iterator[None]:
-    """Keeps in ``store`` every constant that is asked for: a captured graph reads them at each replay."""
+    """Context that stores every :func:`constant` in ``store``, which keeps them alive for a captured graph."""
     _stores.append(store)
     try:
         yield
@@ -59,12 +59,12 @@ def keeping_constants(store: dict[tuple, Tensor]) -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class CloudTable:
-    """``cu_rows``, ``cloud_scene`` and ``cloud_step`` of packed clouds as numbers that the host knows.
+    """Host copy of ``cu_rows``, ``cloud_scene`` and ``cloud_step`` of packed clouds.
 
     Attributes:
-        starts: Q + 1 row numbers.
-        scenes, steps: Q numbers.
-        tensors: the three on the device of the particles.
+        starts: Q + 1 row offsets.
+        scenes, steps: scene and step of each of Q clouds.
+        tensors: the three tensors on the device of the particles.
     """
 
     starts: tuple[int, ...]
@@ -74,7 +74,7 @@ class CloudTable:
 
     @classmethod
     def read(cls, cu_rows: Tensor, cloud_scene: Tensor, cloud_step: Tensor) -> CloudTable:
-        """Waits for the device, once."""
+        """Copies the tensors to the host, with one device synchronisation."""
         values = torch.cat([cu_rows, cloud_scene, cloud_step]).tolist()
         n, m = cu_rows.shape[0], cu_rows.shape[0] + cloud_scene.shape[0]
         tensors = (cu_rows, cloud_scene, cloud_step)
@@ -84,7 +84,7 @@ class CloudTable:
     def make(
         cls, counts: Iterable[int], scenes: Iterable[int], steps: Iterable[int], device: torch.device
     ) -> CloudTable:
-        """``counts``: particles of each cloud."""
+        """Builds a table from the number of particles, scene and step of each cloud."""
         numbers = tuple(accumulate(counts, initial=0)), tuple(scenes), tuple(steps)
         return cls(*numbers, tuple(constant(values, device) for values in numbers))
 
@@ -92,11 +92,11 @@ class CloudTable:
         return len(self.scenes)
 
     def count(self, cloud: int) -> int:
-        """Rows of a cloud."""
+        """Returns the number of particles of a cloud."""
         return self.starts[cloud + 1] - self.starts[cloud]
 
     def row_runs(self, clouds: Sequence[int]) -> list[tuple[int, int]]:
-        """(first row, one behind the last) of ``clouds``; clouds that follow each other share a run."""
+        """Returns the row ranges [begin, end) of ``clouds``; consecutive clouds are merged into one range."""
         runs, before = [], None
         for cloud in clouds:
             begin = runs.pop()[0] if before is not None and cloud == before + 1 else self.starts[cloud]
@@ -106,7 +106,7 @@ class CloudTable:
 
 
 def take_runs(x: Tensor, runs: Sequence[tuple[int, int]]) -> Tensor:
-    """The rows of ``runs`` one after another; a view where there is one run."""
+    """Concatenates the rows of ``runs``; returns a view if there is only one."""
     pieces = split_rows(x, runs)
     if len(pieces) == 1:
         return pieces[0]
@@ -114,10 +114,10 @@ def take_runs(x: Tensor, runs: Sequence[tuple[int, int]]) -> Tensor:
 
 
 def split_rows(x: Tensor, runs: Sequence[tuple[int, int]]) -> list[Tensor]:
-    """Views of the rows of each of ``runs``.
+    """Returns views of the rows of each of ``runs``.
 
-    Where runs ascend, the gradient of all of them is made at once; that of as many slices would be added up slice by
-    slice, each with zeros to the length of ``x``.
+    Ascending runs are made by one ``split``, whose backward pass concatenates gradients once; slices would add one
+    zero-padded gradient of the size of ``x`` each.
     """
     sizes, wanted, end = [], [], 0
     for begin, until in runs:
@@ -136,18 +136,18 @@ def split_rows(x: Tensor, runs: Sequence[tuple[int, int]]) -> list[Tensor]:
 
 @dataclass(frozen=True)
 class Attribute:
-    """How everything treats one per-particle tensor.
+    """Declaration of a per-particle tensor, used by concatenation, edits, validation and sleep.
 
     Attributes:
         name: field of :class:`Particles`.
-        shape: behind the N particles; None where the model chooses the size.
-        kind: "scalar"; "point" (moves and turns with a body), "vector" and "quaternion" (turn with it), "harmonics",
-            "matrix", or "index" (a choice, without gradients).
-        default: value of particle sets without the attribute: a number, "identity", or the attribute that it begins as;
-            None: every particle set has it, or no other may stand in for it.
+        shape: shape after the particle dimension; None for sizes that depend on the model.
+        kind: "scalar", "point" (translates and rotates with a body), "vector" or "quaternion" (rotate with it),
+            "harmonics", "matrix", or "index" (discrete, without gradients).
+        default: value for particles without the attribute: a number, "identity", or the name of the attribute to copy;
+            None if it has no default.
         predicted: whether a step may change it.
-        validated: whether the guards of a step check it; others are checked once, at the start.
-        dtype: other than that of the network.
+        validated: whether every step validates it; others are validated once, at the start.
+        dtype: dtype, if it is not that of the network.
     """
 
     name: str
@@ -160,7 +160,7 @@ class Attribute:
 
     @property
     def is_optional(self) -> bool:
-        """Whether a particle set may lack it while another has it."""
+        """Whether particles without the attribute can be concatenated with others that have it."""
         return self.default is not None
 
 
@@ -191,7 +191,7 @@ ATTRIBUTES = {
 
 
 def attributes_of(*kinds: str) -> tuple[str, ...]:
-    """Names of the attributes of these kinds."""
+    """Returns the names of the attributes of these kinds."""
     return tuple(name for name, attribute in ATTRIBUTES.items() if attribute.kind in kinds)
 
 
@@ -199,18 +199,18 @@ def attributes_of(*kinds: str) -> tuple[str, ...]:
 class Particles(TensorRecord):
     """The state of the simulator: particles with view-independent latent features.
 
-    Particles of two encoded steps are not aligned (each step sees other pixels); those of two simulated steps are.
+    Particles of different encoded steps do not correspond to each other; those of simulated steps do.
 
     Attributes:
         means: [N, 3] metres, world.
         opacities: [N] in (0, 1).
-        dynamic_latents: [N, Fd], change with time.
-        static_latents: [N, Fs], do not.
-        cu_rows: int64 [Q + 1]; the particles of cloud q are cu_rows[q] .. cu_rows[q + 1].
-        cloud_scene: int64 [Q]; clouds are sorted by (scene, step).
-        cloud_step: int64 [Q].
-        activity: uint8 [N], 0 dynamic, 1 frozen (never moves), 2 asleep (never changes, and the dynamics does not see
-            it; see :mod:`gsim3d.numerics.policy`). A masked-out particle is absent.
+        dynamic_latents: [N, Fd], features that change with time.
+        static_latents: [N, Fs], features that stay constant.
+        cu_rows: int64 [Q + 1], offsets; the particles of cloud q are rows cu_rows[q] to cu_rows[q + 1].
+        cloud_scene: int64 [Q], scene of each cloud; clouds are sorted by (scene, step).
+        cloud_step: int64 [Q], step of each cloud.
+        activity: uint8 [N]: 0 dynamic, 1 frozen (never moves), 2 asleep (never changes, and is hidden from the
+            dynamics; see :mod:`gsim3d.numerics.policy`). Masked-out particles are absent.
         origin: float64 [B, 3] metres, lower corner of each scene's workspace.
         quats: [N, 4] (w, x, y, z); only in explicit models.
         scales: [N, 3] metres; only in explicit models.
@@ -224,19 +224,20 @@ class Particles(TensorRecord):
             (:mod:`gsim3d.effects.actors`).
         initial_latents: [N, Fd], the dynamic latents at the start of the simulation; only in models with
             ``background="relightable"``.
-        velocity: [N, 3] metres a step: the last displacement of simulated particles, the mean displacement since the
-            oldest step for encoded particles of the newest step, 0 elsewhere; only in models with inertia.
+        velocity: [N, 3] metres per step: the last displacement of simulated particles, the mean displacement since the
+            oldest step for encoded particles of the newest step, 0 otherwise; only in models with inertia.
         irradiance_gain: [N, 3], factors of the colours of simulated particles: irradiance now over irradiance at
             encoding; only in models with lights.
         light_occlusion: [N, 2 L], optical depth towards each light at encoding and now, or [N, 3 L]: irradiance at
             encoding, n.l, and irradiance now; negative where unknown.
         rest_positions: [N, 3] metres, positions at the start of the simulation, the rest shape of elastic bodies; only
             in models with shape matching.
-        body: [N, 3] metres, where the middle of what is seen of the particle's body was when it was encoded; only in
-            models that segment bodies.
-        world_offset: float64 [B, 3] metres, the point of each scene's world that cameras, origin and positions count
-            from, so that float32 holds them; None: 0. Coordinates in edits and files are those of the world.
-        known: clouds as the host knows them; see :attr:`clouds`.
+        body: [N, 3] metres, centroid of the visible part of the particle's body at encoding, which identifies the body;
+            only in models that segment bodies.
+        world_offset: float64 [B, 3] metres, translation between the coordinates of each scene's files and those of
+            cameras, origin and positions, which keeps the latter small enough for float32; None: 0. Edits and files use
+            the coordinates of the scene's files.
+        known: host copy of the cloud table; see :attr:`clouds`.
     """
 
     means: Tensor
@@ -268,17 +269,17 @@ class Particles(TensorRecord):
 
     @property
     def n_rows(self) -> int:
-        """N."""
+        """Number of particles, N."""
         return self.means.shape[0]
 
     @property
     def n_clouds(self) -> int:
-        """Q."""
+        """Number of clouds, Q."""
         return self.cloud_scene.shape[0]
 
     @property
     def clouds(self) -> CloudTable:
-        """The clouds as the host knows them. Only the first look at clouds given as tensors waits for the device."""
+        """Host copy of the cloud table; only its first use may synchronise the device."""
         tensors = (self.cu_rows, self.cloud_scene, self.cloud_step)
         if self.known is None or any(a is not b for a, b in zip(self.known.tensors, tensors)):
             table = CloudTable.read(*tensors)
@@ -287,40 +288,40 @@ class Particles(TensorRecord):
         return self.known
 
     def with_clouds(self, table: CloudTable, **fields: Tensor) -> Particles:
-        """These particles packed as ``table`` says; ``fields`` replaces what changes with it."""
+        """Returns particles with another cloud table and other ``fields``."""
         cu_rows, scene, step = table.tensors
         return dataclasses.replace(self, **fields, cu_rows=cu_rows, cloud_scene=scene, cloud_step=step, known=table)
 
     @property
     def latents(self) -> Tensor:
-        """[N, Fd + Fs], those that change with time first."""
+        """All latents, [N, Fd + Fs], dynamic ones first."""
         return torch.cat([self.dynamic_latents, self.static_latents], 1)
 
     def row_fields(self) -> dict[str, Tensor]:
-        """The tensors that have one entry a particle, by name."""
+        """Returns the per-particle tensors by name."""
         return {name: value for name in self.ROW_FIELDS if (value := getattr(self, name)) is not None}
 
     def row_cloud(self) -> Tensor:
-        """int64 [N], the cloud of each particle."""
+        """Returns the cloud of each particle, int64 [N]."""
         counts = self.cu_rows[1:] - self.cu_rows[:-1]
         return torch.repeat_interleave(
             torch.arange(self.n_clouds, device=counts.device), counts, output_size=self.n_rows
         )
 
     def row_offset(self) -> Tensor | None:
-        """float64 [N, 3], the ``world_offset`` of each particle's scene."""
+        """Returns the ``world_offset`` of each particle's scene, float64 [N, 3]; None if there is none."""
         return None if self.world_offset is None else self.world_offset[self.cloud_scene[self.row_cloud()]]
 
     def select_rows(self, rows: Tensor) -> Particles:
-        """Keeps ``rows`` (bool [N]); clouds stay, even where they become empty."""
+        """Keeps the particles selected by ``rows`` (bool [N]); clouds remain even if they become empty."""
         kept = torch.zeros(self.n_rows + 1, dtype=torch.int64, device=rows.device)
         kept[1:] = torch.cumsum(rows, 0)
-        chosen = rows.nonzero()[:, 0]  # once: a GPU is waited for
+        chosen = rows.nonzero()[:, 0]  # once for all fields, because it synchronises
         fields = {name: value[chosen] for name, value in self.row_fields().items()}
         return dataclasses.replace(self, **fields, cu_rows=kept[self.cu_rows])
 
     def select_clouds(self, clouds: Sequence[int] | Tensor) -> Particles:
-        """The particles of ``clouds``, ascending."""
+        """Returns the particles of ``clouds``, which must ascend."""
         chosen = clouds.tolist() if isinstance(clouds, Tensor) else list(clouds)
         table, runs = self.clouds, self.clouds.row_runs(chosen)
         table = CloudTable.make(
@@ -333,22 +334,22 @@ class Particles(TensorRecord):
 
 
 def newest_clouds(clouds: CloudTable) -> list[int]:
-    """The last cloud of each scene that has one."""
+    """Returns the last cloud of each scene that has clouds."""
     return _newest(clouds.scenes, clouds.steps)
 
 
 def _newest(scenes: Sequence[int], steps: Sequence[int]) -> list[int]:
-    places = list(zip(scenes, steps))
-    if any(b <= a for a, b in zip(places, places[1:])):
+    keys = list(zip(scenes, steps))
+    if any(b <= a for a, b in zip(keys, keys[1:])):
         raise ValueError(
-            "particles: clouds must be sorted by (scene, step), each once; "
+            "particles: clouds must be sorted by (scene, step), without duplicates; "
             f"got scenes {list(scenes)}, steps {list(steps)}"
         )
     return [q for q in range(len(scenes)) if q + 1 == len(scenes) or scenes[q + 1] != scenes[q]]
 
 
 def _last(scenes: Sequence[int], steps: Sequence[int], n_steps: int) -> list[int]:
-    """The last ``n_steps`` clouds of each scene."""
+    """Returns the last ``n_steps`` clouds of each scene."""
     kept, begin = [], 0
     for last in _newest(scenes, steps):
         kept += range(max(begin, last + 1 - n_steps), last + 1)
@@ -357,24 +358,23 @@ def _last(scenes: Sequence[int], steps: Sequence[int], n_steps: int) -> list[int
 
 
 def append_step(history: Particles, step: Particles, max_steps: int) -> Particles:
-    """``history`` with the clouds of ``step`` behind it; of each scene the last ``max_steps`` clouds stay.
-
-    Scenes without a cloud in ``step`` stay as they are.
-    """
+    """Appends the clouds of ``step`` to ``history`` and keeps the last ``max_steps`` clouds of each scene."""
     return concatenate([history, step], max_steps)
 
 
 def last_steps(particles: Particles, n_steps: int) -> Particles:
-    """The last ``n_steps`` clouds of each scene."""
+    """Returns the particles of the last ``n_steps`` clouds of each scene."""
     kept = _last(particles.clouds.scenes, particles.clouds.steps, n_steps)
     return particles if len(kept) == particles.n_clouds else particles.select_clouds(kept)
 
 
 def with_attribute(particles: Particles, name: str, width: int = 3) -> Particles:
-    """``particles`` with the attribute ``name``, at its default where they had none.
+    """Returns ``particles`` with the attribute ``name``, set to its default if absent.
 
     Args:
-        width: channels, where the attribute itself has no fixed number.
+        particles: the particles.
+        name: name of the attribute.
+        width: number of channels, if the attribute does not fix it.
     """
     if getattr(particles, name) is not None:
         return particles
@@ -382,7 +382,7 @@ def with_attribute(particles: Particles, name: str, width: int = 3) -> Particles
     if attribute.default == "identity":
         one = means.new_ones(particles.n_rows, 1)
         value = F.pad(one, (0, 3)) if attribute.kind == "quaternion" else torch.diag_embed(one.expand(-1, 3))
-    elif isinstance(attribute.default, str):  # guards put broken particles to sleep, and do not check copies
+    elif isinstance(attribute.default, str):  # copies are not validated, so invalid numbers are replaced here
         value = getattr(particles, attribute.default)
         value = (value.detach() if attribute.kind == "point" else value).nan_to_num(0, 0, 0)
     else:
@@ -392,7 +392,7 @@ def with_attribute(particles: Particles, name: str, width: int = 3) -> Particles
 
 
 def with_same_attributes(parts: Sequence[Particles]) -> list[Particles]:
-    """``parts`` with the optional attributes that any of them has."""
+    """Adds to all ``parts`` the optional attributes that any of them has."""
     for name in (name for name, attribute in ATTRIBUTES.items() if attribute.is_optional):
         known = [getattr(part, name) for part in parts if getattr(part, name) is not None]
         if known:
@@ -401,33 +401,37 @@ def with_same_attributes(parts: Sequence[Particles]) -> list[Particles]:
 
 
 def concatenate(parts: Sequence[Particles], max_steps: int | None = None) -> Particles:
-    """The clouds of several particle sets of the same scenes in one, sorted by (scene, step); with ``max_steps`` the
-    last of each scene, each once."""
+    """Concatenates particles of the same scenes, with clouds sorted by (scene, step).
+
+    Args:
+        parts: particles of the same scenes.
+        max_steps: number of last clouds to keep of each scene; requires unique (scene, step). Default: keep all.
+    """
     parts = with_same_attributes(parts)
     tables = [part.clouds for part in parts]
-    places = [(table.scenes[q], table.steps[q], p, q) for p, table in enumerate(tables) for q in range(len(table))]
-    places.sort(key=lambda place: place[:2])
+    clouds = [(table.scenes[q], table.steps[q], p, q) for p, table in enumerate(tables) for q in range(len(table))]
+    clouds.sort(key=lambda cloud: cloud[:2])
     if max_steps is not None:
-        scenes, steps = [place[0] for place in places], [place[1] for place in places]
-        places = [places[i] for i in _last(scenes, steps, max_steps)]
+        scenes, steps = [cloud[0] for cloud in clouds], [cloud[1] for cloud in clouds]
+        clouds = [clouds[i] for i in _last(scenes, steps, max_steps)]
     table = CloudTable.make(
-        (tables[p].count(q) for _, _, p, q in places),
-        (scene for scene, *_ in places),
-        (step for _, step, *_ in places),
+        (tables[p].count(q) for _, _, p, q in clouds),
+        (scene for scene, *_ in clouds),
+        (step for _, step, *_ in clouds),
         parts[0].cu_rows.device,
     )
-    taken = [sorted(q for *_, of, q in places if of == p) for p in range(len(parts))]
-    runs = [[table.row_runs([q])[0] for q in clouds] for table, clouds in zip(tables, taken, strict=True)]
-    order = {cloud: i for i, cloud in enumerate((p, q) for p, clouds in enumerate(taken) for q in clouds)}
+    taken = [sorted(q for *_, part, q in clouds if part == p) for p in range(len(parts))]
+    runs = [[own.row_runs([q])[0] for q in chosen] for own, chosen in zip(tables, taken, strict=True)]
+    order = {key: i for i, key in enumerate((p, q) for p, chosen in enumerate(taken) for q in chosen)}
     fields = {}
     for name, value in parts[0].row_fields().items():
-        pieces = [rows for part, of in zip(parts, runs, strict=True) for rows in split_rows(getattr(part, name), of)]
-        fields[name] = torch.cat([pieces[order[p, q]] for *_, p, q in places]) if places else value
+        pieces = [rows for part, own in zip(parts, runs, strict=True) for rows in split_rows(getattr(part, name), own)]
+        fields[name] = torch.cat([pieces[order[p, q]] for *_, p, q in clouds]) if clouds else value
     return parts[0].with_clouds(table, **fields)
 
 
 def single_steps(particles: Particles) -> list[Particles]:
-    """The clouds of scenes with equally many steps, step by step: one cloud a scene in each."""
+    """Splits particles of scenes with equal numbers of steps into one Particles per step, with one cloud per scene."""
     n_scenes = len(newest_clouds(particles.clouds))
     n_steps = particles.n_clouds // n_scenes if n_scenes else 1
     if n_steps == 1:
@@ -437,7 +441,7 @@ def single_steps(particles: Particles) -> list[Particles]:
 
 @dataclass(frozen=True)
 class Gaussians(TensorRecord):
-    """3D Gaussians, packed like the particles they came from.
+    """3D Gaussians, packed like the particles they were decoded from.
 
     Attributes:
         means: [N, 3] metres.
@@ -445,9 +449,9 @@ class Gaussians(TensorRecord):
         scales: [N, 3] metres.
         opacities: [N] in (0, 1).
         sh: [N, K, 3] coefficients of the standard 3DGS basis (K = (degree + 1)^2; colour = sum + 0.5, clamped at 0);
-            None where no colour is asked for.
-        cu_rows: int64 [Q + 1].
-        world_offset: float64 [Q, 3] metres, what positions of a cloud count from; None: 0.
+            None if colours are not needed.
+        cu_rows: int64 [Q + 1], offsets of the clouds.
+        world_offset: float64 [Q, 3] metres, ``world_offset`` of each cloud's scene; None: 0.
     """
 
     means: Tensor

@@ -126,7 +126,7 @@ def test_checkpoints_that_are_refused(folder):
 def test_saving_replaces_checkpoints_alone(simulator, folder, tmp_path):
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "a.txt").write_text("kept")
-    with pytest.raises(InputError, match="notes: exists and is no checkpoint"):
+    with pytest.raises(InputError, match="notes: exists and is not a checkpoint"):
         simulator.save_pretrained(tmp_path / "notes")
     assert (tmp_path / "notes" / "a.txt").read_text() == "kept"
     assert simulator.save_pretrained(folder) == folder
@@ -160,5 +160,5 @@ def test_scene_is_a_source_of_frames(tmp_path):
     assert prediction.renderings[0].color.shape == (1, scene.height, scene.width, 3)
     kept = dataclasses.replace(simulator.inputs, target_only_cameras=(2,))
     assert torch.equal(scene.input_frames(kept).cameras.viewmats[:2], scene.cameras_at([0, 3], [0]).viewmats)
-    with pytest.raises(InputError, match="2 steps from step 3 on do not fit its 4 steps"):
+    with pytest.raises(InputError, match="needs 2 steps from step 3, but the scene has 4 steps"):
         scene.input_frames(simulator.inputs, start=3)

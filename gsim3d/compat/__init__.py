@@ -1,4 +1,4 @@
-"""Checkpoints of the authors' release and of earlier versions."""
+"""Compatibility with checkpoints of the authors' release and of earlier versions of gsim3d."""
 
 
 def __getattr__(name):

@@ -1,4 +1,4 @@
-"""Configurations and weights of older checkpoints in the terms of this version."""
+"""Conversion of configurations and weights of older checkpoints to this version."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from gsim3d.errors import InputError
 
 
 def current_model(section: dict[str, Any]) -> dict[str, Any]:
-    """A saved ``model`` section as this version writes it.
+    """Converts a saved ``model`` section to this version.
 
     Raises:
-        InputError: it describes a model that this version does not have.
+        InputError: this version does not support the model.
     """
     section = {name: dict(part) if isinstance(part, dict) else part for name, part in section.items()}
     if _is_released(section):
         section["release"] = True
     parts = {name: part for name, part in section.items() if isinstance(part, dict)}
     if "renderer" in parts:
-        parts["renderer"].setdefault("jacobian", "clamped")  # older than the choice
+        parts["renderer"].setdefault("jacobian", "clamped")  # before the option existed
     if "dynamics" in parts:
         _name_priors(parts["dynamics"])
     if "on_bad" in parts.get("stability", {}):
@@ -33,27 +33,27 @@ def current_model(section: dict[str, Any]) -> dict[str, Any]:
 
 
 def current_data(section: dict[str, Any]) -> dict[str, Any]:
-    """A saved ``data`` section without ``near_far`` where it is text, "of each scene", as version 0.1 wrote."""
+    """Converts a saved ``data`` section: drops a textual ``near_far`` ("of each scene"), as version 0.1 wrote it."""
     return {name: value for name, value in section.items() if name != "near_far" or not isinstance(value, str)}
 
 
 def _is_released(section: dict[str, Any]) -> bool:
-    """Takes the switches for published behaviour out of all parts; whether they were on."""
-    said = {}
+    """Removes the switches for published behaviour from all parts; returns whether they were on."""
+    found = {}
     for name in ("encoder", "dynamics", "renderer"):
         switches = section[name].pop("quirks", None) if isinstance(section.get(name), dict) else None
         if isinstance(switches, dict):
-            said |= {f"{name}.quirks.{key}": value for key, value in switches.items()}
-    on = [name for name, value in said.items() if value is True]
-    if on and len(on) < len(said):
+            found |= {f"{name}.quirks.{key}": value for key, value in switches.items()}
+    on = [name for name, value in found.items() if value is True]
+    if on and len(on) < len(found):
         raise InputError(
-            f"model.{on[0]}: on, but others are off; models have all published behaviour or none: import the published "
-            "checkpoint again (gsim3d import)"
+            f"model.{on[0]}: on, but other quirks are off, which is not supported: import the published checkpoint "
+            "again (gsim3d import)"
         )
     return bool(on)
 
 
-SWITCHES = {  # of the dynamics, and what they were by default, where priors are a list now
+SWITCHES = {  # former switches of the dynamics with their defaults, replaced by the list of priors
     "position_waves": 0,
     "motion_length": None,
     "velocity": False,
@@ -67,7 +67,7 @@ SWITCHES = {  # of the dynamics, and what they were by default, where priors are
     "surfaces": False,
 }
 OCCLUSION = {"shading": "occlusion", "strength": 0.2, "unit": 0.1, "beam": 2.0}
-PARAMETERS = {  # of priors, by their older names below "dynamics."
+PARAMETERS = {  # former name below "dynamics." -> name below "dynamics.priors."
     "gravity": "gravity.acceleration",
     "friction": "contact.friction",
     "skin": "contact.offset",
@@ -78,7 +78,7 @@ PARAMETERS = {  # of priors, by their older names below "dynamics."
 
 
 def _name_priors(section: dict[str, Any]) -> None:
-    """Puts a list of priors in place of switches into a saved section of the dynamics."""
+    """Replaces the switches in a saved dynamics section by a list of priors, in place."""
     switches = {name: section.pop(name, default) for name, default in SWITCHES.items()}
     if section.get("background") == "relit":
         section["background"] = "relightable"
@@ -87,13 +87,13 @@ def _name_priors(section: dict[str, Any]) -> None:
 
 
 def _priors_of(switches: dict[str, Any], position_length: float) -> list[dict[str, Any]]:
-    """The list of priors that older switches stood for, in the order of their columns."""
+    """Returns the priors that older switches enabled, in the order of their weight columns."""
     motion_length, contact_length, gravity = (switches[f] for f in ("motion_length", "contact_length", "gravity"))
     velocity, deformation, pushes = (switches[f] for f in ("velocity", "deformation", "pushes"))
     if (motion_length is not None or deformation) and not velocity:
-        raise InputError("model.dynamics.motion_length without velocity: this version has no such prior; train anew")
+        raise InputError("model.dynamics.motion_length without velocity: not supported in this version; train again")
     if gravity is not None and not pushes:
-        raise InputError("model.dynamics.gravity without pushes: this version has no such prior; train anew")
+        raise InputError("model.dynamics.gravity without pushes: not supported in this version; train again")
     window, waves, lights = {"radius": motion_length}, switches["position_waves"], switches["lights"]
     of_body = {"min_opacity": 0.5} if pushes else {}
     shape = {} if pushes else {"stiffness": 0.3, "position_gradients": False}
@@ -113,9 +113,9 @@ def _priors_of(switches: dict[str, Any], position_length: float) -> list[dict[st
 
 
 def current_weights(weights: Mapping[str, Tensor], dynamics: DynamicsConfig) -> dict[str, Tensor]:
-    """Weights of a simulator with such ``dynamics``, where those of priors are part of others', under their own names.
+    """Splits weights of priors, which older versions stored as columns of shared layers, into layers of their own.
 
-    The products of the network have the same columns in the same order as before, so that results have equal bits.
+    The columns keep their order in the matrix products, so that results have equal bits.
     """
     weights, start = dict(weights), "dynamics.priors."
     stem, conditioning = "dynamics.net.stem.conv.weight", weights.pop("dynamics.net.stem.told.weight", None)
@@ -141,7 +141,7 @@ def current_weights(weights: Mapping[str, Tensor], dynamics: DynamicsConfig) -> 
 
 
 def _split_head(weights: Mapping[str, Tensor], layout: StateLayout) -> dict[str, Tensor]:
-    """The last layer of the head and those of priors: gains of motions came behind displacements, others last."""
+    """Splits the last layer of the head; gains of "means" followed the displacements, other gains came last."""
     of_means = [(name, n) for name, n, changed in layout.gains if changed == "means"]
     others = [(name, n) for name, n, changed in layout.gains if changed != "means"]
     order = []

@@ -1,7 +1,7 @@
-"""Weights of the published model under the names of this one, and back.
+"""Conversion of state dicts between the published model and gsim3d.
 
-Two things differ beside the names: latents come from one convolution here, and explicit particles carry harmonics in
-the standard basis, so the layers of the dynamics that read and write them absorb a fixed change of basis.
+Besides names, two things differ: gsim3d predicts all latents with one convolution, and stores spherical harmonics of
+explicit particles in the standard basis, so the first and last layer of the dynamics absorb a change of basis.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from gsim3d.dynamics.step import StateLayout
 from gsim3d.math.spherical_harmonics import rotate_harmonics
 from gsim3d.presets import ModelConfig
 
-ENCODER, DYNAMICS, HEAD = "encoder.", "dynamic_model.net.", "decoder."  # the published model's parts
-_COUNTER = "num_batches_tracked"  # of batch norms; nothing reads it
+ENCODER, DYNAMICS, HEAD = "encoder.", "dynamic_model.net.", "decoder."  # name prefixes of the published model
+_COUNTER = "num_batches_tracked"  # unused buffer of batch norms
 
-# (published, ours); # is a number. The first that matches the start of a name counts, in either direction.
+# (published, ours) prefixes; # stands for a number. The first matching pair applies, in either direction.
 _BLOCK = [
     ("cpe.0", "position.conv"),
     ("cpe.1", "position.linear"),
@@ -68,7 +68,7 @@ LATENTS = [f"depth_predictor.to_mono_features.{kind}_latent_features." for kind 
 
 
 def _rename(name: str, pairs: list[tuple[str, str]], head: str = "#") -> str:
-    """``name`` with the start that a pair names first replaced by its second; as it is where no pair fits."""
+    """Replaces the prefix of ``name`` by the first matching pair; returns it unchanged if no pair matches."""
     for before, after in pairs:
         pattern = re.escape(before.format(head=head)).replace(r"\#", r"(\d+)")
         if match := re.match(rf"{pattern}(?=\.|$)", name):
@@ -83,7 +83,7 @@ def _reversed(pairs: list[tuple[str, str]]) -> list[tuple[str, str]]:
 
 
 def encoder_weights(published: dict[str, Tensor]) -> dict[str, Tensor]:
-    """State dict below "encoder." -> that of :class:`gsim3d.nn.multiview_encoder.Encoder`."""
+    """Converts the weights below "encoder." to :class:`gsim3d.nn.multiview_encoder.Encoder`."""
     weights = {
         _rename(name, _ENCODER): value for name, value in published.items() if not name.startswith(tuple(LATENTS))
     }
@@ -95,18 +95,18 @@ def encoder_weights(published: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def dynamics_weights(published: dict[str, Tensor]) -> dict[str, Tensor]:
-    """State dict below "dynamic_model.net." -> that of :class:`gsim3d.nn.point_transformer.PointTransformer`."""
+    """Converts the weights below "dynamic_model.net." to :class:`gsim3d.nn.point_transformer.PointTransformer`."""
     return {_rename(name, _DYNAMICS): value for name, value in published.items() if not name.endswith(_COUNTER)}
 
 
 def head_weights(published: dict[str, Tensor]) -> dict[str, Tensor]:
-    """State dict below "decoder." -> that of :class:`gsim3d.nn.gaussian_head.GaussianHead`."""
+    """Converts the weights below "decoder." to :class:`gsim3d.nn.gaussian_head.GaussianHead`."""
     weights = {_rename(name, _HEAD): value for name, value in published.items()}
     return weights | {"fc2.bias": torch.zeros_like(weights["fc2.weight"][:, 0])}
 
 
 def from_published(published: dict[str, Tensor], config: ModelConfig) -> dict[str, Tensor]:
-    """The published model's state dict -> that of :class:`gsim3d.Simulator`; all names must be known."""
+    """Converts a state dict of the published model to :class:`gsim3d.Simulator`; all names must be known."""
     parts = {part: _below(published, part) for part in (ENCODER, DYNAMICS, HEAD)}
     weights = {f"encoder.{name}": value for name, value in encoder_weights(parts[ENCODER]).items()}
     weights |= {f"dynamics.net.{name}": value for name, value in dynamics_weights(parts[DYNAMICS]).items()}
@@ -116,7 +116,7 @@ def from_published(published: dict[str, Tensor], config: ModelConfig) -> dict[st
 
 
 def to_published(weights: dict[str, Tensor], config: ModelConfig) -> dict[str, Tensor]:
-    """The way back. (The published head has no bias in its last layer: one that is not zero is lost.)"""
+    """Inverse of :func:`from_published`. The published head has no bias in its last layer: a nonzero one is dropped."""
     if config.encoder.explicit:
         weights = _change_basis(dict(weights), config, harmonics_matrix(config.encoder.sh_degree).T)
     published = {}
@@ -141,28 +141,28 @@ def to_published(weights: dict[str, Tensor], config: ModelConfig) -> dict[str, T
 
 
 def harmonics_matrix(degree: int) -> Tensor:
-    """float64 [K, K]: coefficients in the published basis -> in the standard one, for the same colours.
+    """Returns the orthogonal matrix, float64 [K, K], from published to standard harmonic coefficients.
 
-    The published basis is the standard one of (z, x, y) instead of (x, y, z). The matrix is orthogonal.
+    The published basis is the standard one evaluated at (z, x, y) instead of (x, y, z).
     """
     each = torch.eye((degree + 1) ** 2, dtype=torch.float64)
     return rotate_harmonics(each[None], published_axes(each).T[None])[0]
 
 
 def _change_basis(weights: dict[str, Tensor], config: ModelConfig, matrix: Tensor) -> dict[str, Tensor]:
-    """Weights of dynamics that see harmonics c as ``matrix @ c``."""
+    """Changes the basis of harmonics in the weights of the dynamics by ``matrix``."""
     layout = StateLayout.of(config.dynamics)
-    wide = torch.block_diag(*[matrix] * 3)  # of the channels (3, K)
+    wide = torch.block_diag(*[matrix] * 3)  # for channels (3, K)
     for name, fields, axis, repeats in (
         ("stem.conv.weight", layout.inputs, -1, 1),
         ("head.fc2.weight", layout.outputs, 0, config.dynamics.steps_per_call),
         ("head.fc2.bias", layout.outputs, 0, config.dynamics.steps_per_call),
     ):
         names, widths = zip(*fields, strict=True)
-        place = names.index("sh")
+        index = names.index("sh")
         after = weights[f"dynamics.net.{name}"].clone()
-        for start in range(sum(widths[:place]), repeats * sum(widths), sum(widths)):
-            part = after.narrow(axis, start, widths[place]).movedim(axis, -1)
+        for start in range(sum(widths[:index]), repeats * sum(widths), sum(widths)):
+            part = after.narrow(axis, start, widths[index]).movedim(axis, -1)
             part.copy_(part.double() @ wide.T.to(part.device))
         weights[f"dynamics.net.{name}"] = after
     return weights

@@ -1,7 +1,7 @@
-"""The published model's settings: what of its YAML file this model understands, ignores and refuses.
+"""Conversion of the published model's YAML configuration.
 
-Sizes that the weights show are taken from them; what no shape shows (strides, heads, cell size, limits, history) comes
-from the file.
+Sizes are taken from the shapes of the weights where possible; the rest (strides, heads, grid size, limits, history)
+comes from the file.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ EXPLICIT = {"means", "opacities", "rotations", "scales", "harmonics"}
 MAX_SH_DEGREE = 3
 HISTORIES = (1, 2, 4, 8)
 PREDICTS = {"cx_x": "from_newest", "cx_dx": "from_previous", "z_x": "absolute"}
-# Settings that must have one value, for the model here has no other; section -> key -> value.
+# Settings with a single supported value: section -> key -> value.
 FIXED = {
     "model.encoder": {
         "name": "costvolume", "num_surfaces": 1, "gaussians_per_pixel": 1, "use_epipolar_trans": False,
@@ -48,12 +48,14 @@ NO_MEANING = object()
 
 @dataclass(frozen=True)
 class ReleasedConfig:
-    """What a published checkpoint is, in this model's terms.
+    """Converted configuration of a published checkpoint.
 
     Attributes:
-        data: the data section of a checkpoint's config.yaml.
-        notes: what a user should know, one sentence each.
-        ignored: keys of the file that change nothing here.
+        model: model configuration.
+        data: data section of a checkpoint's config.yaml.
+        effects: effects that the model was trained to simulate.
+        notes: remarks for the user.
+        ignored: keys of the file without effect in gsim3d.
     """
 
     model: ReleasedModelConfig
@@ -64,21 +66,21 @@ class ReleasedConfig:
 
 
 class _Settings:
-    """A nested mapping that remembers which of its keys were read."""
+    """A nested mapping with validating accessors, which records the keys that were read."""
 
     def __init__(self, content: dict):
         self.content, self.read = content, set()
 
     def get(self, path: str, default: Any = NO_MEANING) -> Any:
-        """The value at a dotted path; without a default it must be there."""
+        """Returns the value at a dotted path; raises InputError if it is missing and there is no default."""
         value = self.content
         self.read.add(path)
         for key in path.split("."):
             if not isinstance(value, dict) or key not in value:
                 if default is NO_MEANING:
                     raise InputError(
-                        f"{path}: is missing; the resolved configuration that lies beside a checkpoint is needed, an "
-                        "experiment's overrides alone do not say what a model is"
+                        f"{path}: is missing; use the resolved configuration that is saved with a checkpoint, not the "
+                        "overrides of an experiment"
                     )
                 return default
             value = value[key]
@@ -102,7 +104,7 @@ class _Settings:
 
     def whole(self, path: str, default: Any = NO_MEANING) -> int:
         value = self.get(path, default)
-        self._check(type(value) is int, path, "a whole number", value)
+        self._check(type(value) is int, path, "an integer", value)
         return value
 
     def flag(self, path: str, default: Any = NO_MEANING) -> bool:
@@ -114,7 +116,7 @@ class _Settings:
         value = self.get(path)
         good = isinstance(value, list) and all(type(n) is int and 0 < n < 2**20 for n in value)
         good = good and count in (None, len(value))
-        self._check(good, path, f"a list of {count or 'any number of'} whole numbers", value)
+        self._check(good, path, f"a list of {count or 'any number of'} integers", value)
         return tuple(value)
 
     def names(self, path: str) -> set[str]:
@@ -124,7 +126,7 @@ class _Settings:
         return set(value)
 
     def unread(self) -> list[str]:
-        """Dotted paths of the deepest mappings and values that nobody asked for."""
+        """Returns the dotted paths of values, or of whole mappings, that were not read."""
         return sorted(self._unread(self.content, ""))
 
     def _unread(self, value: Any, path: str) -> list[str]:
@@ -138,49 +140,50 @@ class _Settings:
 
 
 class _Sizes:
-    """What shapes say; where the file says something else, a note."""
+    """Sizes taken from the shapes of weights; records a note if the settings differ."""
 
     def __init__(self, shapes: Shapes, settings: _Settings):
         self.shapes, self.settings, self.notes = shapes, settings, []
 
     def of(self, name: str, axis: int = 0) -> int:
-        """Size of a published tensor along an axis; 0 where it does not exist."""
+        """Returns the size of a published tensor along an axis; 0 if it does not exist."""
         shape = self.shapes.get(name, ())
         return shape[axis] if len(shape) > axis else 0
 
     def needed(self, name: str, axis: int = 0) -> int:
         if size := self.of(name, axis):
             return size
-        raise InputError(f"weights: {name} is missing or has no axis {axis}; this is no published 3DGSim model")
+        raise InputError(f"weights: {name} is missing or has no axis {axis}; this is not a published 3DGSim model")
 
     def agreed(self, path: str, found: Any, default: Any = NO_MEANING) -> Any:
-        """``found``, with a note where the settings have another value at ``path``."""
-        said = self.settings.get(path, default)
-        if said is not NO_MEANING and said is not None and said != found:
-            self.notes.append(f"{path} is {shown(said)}, but the weights have {shown(found)}, which holds")
+        """Returns ``found``; records a note if the settings have another value at ``path``."""
+        given = self.settings.get(path, default)
+        if given is not NO_MEANING and given is not None and given != found:
+            self.notes.append(f"{path} is {shown(given)}, but the weights have {shown(found)}, which is used")
         return found
 
     def count(self, pattern: str) -> int:
-        """How many different numbers the names have at the group of ``pattern``."""
+        """Returns the number of distinct indices that names have at the group of ``pattern``."""
         return len({match[1] for name in self.shapes if (match := re.match(pattern, name))})
 
 
 def read_config(content: dict, shapes: Shapes) -> ReleasedConfig:
-    """Settings of a published run and the shapes of its weights -> what this model is to be.
+    """Converts the settings of a published run.
 
     Args:
-        content: the YAML file's mapping.
-        shapes: published name -> shape.
+        content: content of the YAML file.
+        shapes: published name -> shape of the weights.
+
     Raises:
-        InputError: a setting is missing, of a wrong type, or one that this model has not; the message names it.
+        InputError: a setting is missing, of the wrong type or not supported; the message names it.
     """
     settings = _Settings(content)
     sizes = _Sizes(shapes, settings)
     for section, values in FIXED.items():
         for key, value in values.items():
-            said = settings.get(f"{section}.{key}", value)
-            if said != value:
-                raise InputError(f"{section}.{key}: {shown(said)} is not supported; only {value!r} is")
+            given = settings.get(f"{section}.{key}", value)
+            if given != value:
+                raise InputError(f"{section}.{key}: {shown(given)} is not supported; only {value!r} is")
     explicit = _is_explicit(settings, sizes)
     n_dynamic, n_static = (
         sizes.agreed(f"model.state_adapter.{kind}_latent_feature_dim", sizes.of(f"{ENCODER}{prefix}weight"), 0)
@@ -208,13 +211,13 @@ def read_config(content: dict, shapes: Shapes) -> ReleasedConfig:
         renderer = RendererConfig(latents=latents, sh_degree=sh_degree, jacobian="clamped", **scales)
         model = ReleasedModelConfig(encoder, dynamics, renderer)
     except ValueError as error:
-        raise InputError(f"the settings and the weights do not make a model: {error}") from None
+        raise InputError(f"settings and weights do not describe a valid model: {error}") from None
     data, effects, notes = _data(settings, history, encoder.size_multiple)
     return ReleasedConfig(model, data, effects, (*sizes.notes, *notes), tuple(settings.unread()))
 
 
 def _is_explicit(settings: _Settings, sizes: _Sizes) -> bool:
-    """Whether particles carry all Gaussian parameters."""
+    """Returns whether particles carry all Gaussian parameters."""
     params = settings.names("model.state_adapter.state_3dgs_params")
     explicit = sizes.needed(f"{ENCODER}depth_predictor.to_gaussians.2.weight") > 2
     if params not in ({"means", "opacities"}, EXPLICIT):
@@ -223,9 +226,9 @@ def _is_explicit(settings: _Settings, sizes: _Sizes) -> bool:
             f"got {', '.join(sorted(params))}"
         )
     if explicit != (params == EXPLICIT):
-        said, found = ("latent", "explicit") if explicit else ("explicit", "latent")
+        given, found = ("latent", "explicit") if explicit else ("explicit", "latent")
         raise InputError(
-            f"model.state_adapter.state_3dgs_params describes the {said} variant, but the weights are of the {found} "
+            f"model.state_adapter.state_3dgs_params describes the {given} variant, but the weights are of the {found} "
             "one: this configuration belongs to another checkpoint"
         )
     return explicit
@@ -241,37 +244,39 @@ def _sh_degree(sizes: _Sizes, explicit: bool) -> int:
 
 
 def _updates(settings: _Settings, sizes: _Sizes, explicit: bool, n_dynamic: int, sh_degree: int) -> dict[str, Any]:
-    """How a prediction becomes the next states; refuses ways that this model has not."""
+    """Converts the settings of state updates; raises InputError for unsupported ones."""
     adapter = "model.state_adapter"
     changing = {"means"} | (settings.names(f"{adapter}.dynamic_state_keys") & EXPLICIT)
     if explicit and changing != EXPLICIT:
         missing = ", ".join(sorted(EXPLICIT - changing))
-        raise InputError(f"{adapter}.dynamic_state_keys: explicit particles change in everything; {missing} is missing")
+        raise InputError(
+            f"{adapter}.dynamic_state_keys: must contain all attributes of explicit particles; {missing} is missing"
+        )
     if not explicit and "opacities" in changing:
-        raise InputError(f"{adapter}.dynamic_state_keys: opacities that change are not supported beside latents")
+        raise InputError(f"{adapter}.dynamic_state_keys: changing opacities are not supported in the latent variant")
     changing = (EXPLICIT if explicit else {"means"}) | ({"dynamic_latent_features"} if n_dynamic else set())
     given = settings.get(f"{adapter}.pred_modality", {})
-    said = {key: given.get(key, "z_x") if isinstance(given, dict) else given for key in sorted(changing)}
-    if any(one != said["means"] for one in said.values()) or str(said["means"]) not in PREDICTS:
+    modes = {key: given.get(key, "z_x") if isinstance(given, dict) else given for key in sorted(changing)}
+    if any(mode != modes["means"] for mode in modes.values()) or str(modes["means"]) not in PREDICTS:
         known = ", ".join(PREDICTS)
-        raise InputError(f"{adapter}.pred_modality: must be one of {known} for all that changes; got {said}")
+        raise InputError(f"{adapter}.pred_modality: must be one of {known}, equal for all attributes; got {modes}")
     immune = settings.names(f"{adapter}.immune_to_static") if explicit else {"harmonics"}
     if immune & EXPLICIT != {"harmonics"}:
         got = ", ".join(sorted(immune)) or "nothing"
-        raise InputError(f"{adapter}.immune_to_static: must be harmonics alone; got {got}")
+        raise InputError(f"{adapter}.immune_to_static: must be [harmonics]; got {got}")
     history = settings.whole("dataset.n_step_state")
     advanced = settings.whole("dataset.n_step_state_predict", 1)
     advanced = history if advanced < 0 else min(advanced, history)
     if advanced != 1:
-        raise InputError(f"dataset.n_step_state_predict: advances {advanced} old steps at once; only 1 is supported")
-    predicts = PREDICTS[said["means"]]
+        raise InputError(f"dataset.n_step_state_predict: {advanced} is not supported; only 1 is")
+    predicts = PREDICTS[modes["means"]]
     turn = 4 if predicts == "absolute" else 3
     width = n_dynamic + 3 + (3 * (sh_degree + 1) ** 2 + 1 + turn + 3 if explicit else 0)
     rows = sizes.needed(f"{DYNAMICS}dec.{_n_stages(sizes) - 1}.fc2.weight")
     if rows % width:
         raise InputError(
-            f"weights: the dynamics predicts {rows} numbers a particle, but a step of this variant takes {width}: this "
-            "configuration belongs to another checkpoint"
+            f"weights: the dynamics predicts {rows} values per particle, but a step of this variant needs {width}: "
+            "this configuration belongs to another checkpoint"
         )
     steps_per_call = sizes.agreed("dataset.n_step_predict_multiple", rows // width, 1)
     metric = settings.positive(f"{adapter}.metric")
@@ -340,7 +345,7 @@ def _dynamics(settings: _Settings, sizes: _Sizes) -> dict[str, Any]:
             raise InputError(f"{net}.{name}: must be powers of two; got {list(values)}")
     patches = settings.wholes(f"{net}.enc_patch_size", n)
     if settings.wholes(f"{net}.dec_patch_size", n - 1) != patches[:-1]:
-        raise InputError(f"{net}.dec_patch_size: must equal enc_patch_size of the same stages")
+        raise InputError(f"{net}.dec_patch_size: must equal enc_patch_size at the same stages")
     first = f"{DYNAMICS}enc.enc0.block0.mlp.0.fc1.weight"
     return {
         "grid_size": settings.positive(f"{net}.grid_size"),
@@ -362,13 +367,13 @@ def _dynamics(settings: _Settings, sizes: _Sizes) -> dict[str, Any]:
 
 
 def _data(settings: _Settings, history: int, size_multiple: int) -> tuple[dict[str, Any], EffectsSpec, list[str]]:
-    """The data section of config.yaml, what is simulated, and notes on what differs."""
+    """Returns the data section of config.yaml, the effects, and notes on differences."""
     height, width = settings.wholes("dataset.image_shape", 2)
     near, far = settings.positive("dataset.near"), settings.positive("dataset.far")
     if far <= near:
         raise InputError(f"dataset.far: must lie beyond near; got near {near} and far {far}")
     if settings.flag("dataset.baseline_scale_bounds", False):
-        raise InputError("dataset.baseline_scale_bounds: depth bounds that change with the scene are not supported")
+        raise InputError("dataset.baseline_scale_bounds: depth bounds that depend on the scene are not supported")
     if width % size_multiple or height % size_multiple:
         raise InputError(f"dataset.image_shape: must be multiples of {size_multiple}; got {height}, {width}")
     views, notes = _views(settings)
@@ -383,27 +388,25 @@ def _data(settings: _Settings, history: int, size_multiple: int) -> tuple[dict[s
     with_seg = settings.flag("dataset.with_seg", False)
     effects = EffectsSpec(dynamics=DynamicsEffects(background="frozen" if with_seg else "dynamic"))
     if not with_seg:
-        notes.append("dataset.with_seg is false: the model never saw which pixels may move, so every particle may move")
+        notes.append("dataset.with_seg is false: trained without segmentation, so all particles are movable")
     if not settings.flag("dataset.with_mask", False):
-        notes.append(
-            "dataset.with_mask is false: it saw every pixel; here those that a scene labels 0 make no particle"
-        )
+        notes.append("dataset.with_mask is false: trained on all pixels; gsim3d skips pixels with label 0")
     if settings.get("dataset.workspace_limits", None) is not None:
-        notes.append("dataset.workspace_limits is set: published dynamics leave out what began outside, these do not")
+        notes.append("dataset.workspace_limits is set: the published dynamics excludes particles outside, gsim3d not")
     if settings.get("dataset.background_color", [0, 0, 0]) not in (None, 0, [0, 0, 0]):
-        notes.append("dataset.background_color is not black: pass it as background when you render")
-    if settings.get("dataset.speedup", 1) != 1:
-        notes.append(f"dataset.speedup is {settings.get('dataset.speedup')}: it saw every such frame only")
+        notes.append("dataset.background_color is not black: pass it as background to render")
+    if (speedup := settings.get("dataset.speedup", 1)) != 1:
+        notes.append(f"dataset.speedup is {speedup}: trained on every frame number {speedup} only")
     return data, effects, notes
 
 
 def _views(settings: _Settings) -> tuple[dict[str, Any], list[str]]:
-    """Which cameras are the input, and which are looked at only."""
+    """Converts the input and target cameras."""
     sampler, notes = "dataset.view_sampler", []
     fixed, drawn = (settings.get(f"{sampler}.{name}", None) or [] for name in ("test_context_views", "context_views"))
     inputs = fixed or drawn
     if inputs and isinstance(inputs, list) and all(isinstance(group, list) for group in inputs):
-        notes.append(f"{sampler} gives step t its own group of context views; here all steps use the first group")
+        notes.append(f"{sampler} has a group of context views per step; gsim3d uses the first group at all steps")
         inputs = inputs[0]
     targets = settings.get(f"{sampler}.test_target_views", None)
     targets = targets if isinstance(targets, list) else []
@@ -411,7 +414,7 @@ def _views(settings: _Settings) -> tuple[dict[str, Any], list[str]]:
         if not isinstance(cams, list) or not all(type(cam) is int and cam >= 0 for cam in cams):
             raise InputError(f"{sampler}.{name}: must be a list of camera numbers; got {shown(cams)}")
     count = settings.whole(f"{sampler}.num_context_views")
-    if inputs:  # all of those given for tests; as many as asked for, of those to draw from
+    if inputs:  # all test views, or the requested number of the views to draw from
         count = len(inputs) if fixed else min(count, len(inputs))
     views = {
         "context_views": count,

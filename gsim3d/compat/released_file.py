@@ -1,8 +1,8 @@
-"""Tensors of a file that ``torch.save`` wrote, read without running anything that is in it.
+"""Safe reader of tensors in files of ``torch.save``, without executing code in them.
 
-Such a file is a zip archive: ``data.pkl`` says what there is, ``data/0``, ``data/1`` ... hold the numbers. A pickle can
-name any function to be called. Here tensors are rebuilt by this module, a few packages that training tools leave traces
-of become empty placeholders, and every other name is refused.
+Such a file is a zip archive with a pickle ``data.pkl`` and storages ``data/0``, ``data/1``, ... A pickle can call any
+function. This reader rebuilds tensors itself, replaces objects of known training packages by placeholders, and rejects
+every other name.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from gsim3d.errors import InputError
 from gsim3d.io.files import shown
 from gsim3d.io.pickles import check_pickle
 
-# What zipfile raises for an archive that is broken, encrypted or larger than memory.
+# Exceptions of zipfile for archives that are damaged, encrypted or larger than memory.
 BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, OSError, MemoryError, RuntimeError, ValueError)
-MAX_INDEX = 256 * 2**20  # bytes of data.pkl; that of a model with a million tensors is smaller
+MAX_INDEX = 256 * 2**20  # bytes of data.pkl; enough for a million tensors
 
 _DTYPES = {
     "FloatStorage": torch.float32, "DoubleStorage": torch.float64, "HalfStorage": torch.float16,
     "BFloat16Storage": torch.bfloat16, "LongStorage": torch.int64, "IntStorage": torch.int32,
     "ShortStorage": torch.int16, "CharStorage": torch.int8, "ByteStorage": torch.uint8, "BoolStorage": torch.bool,
 }  # fmt: skip
-# What Lightning, its callbacks and OmegaConf put beside the weights: nothing of it is needed, so nothing of it is made.
+# Objects of Lightning, its callbacks and OmegaConf next to the weights, which are replaced by placeholders.
 _PLACEHOLDER_PACKAGES = {
     "pytorch_lightning", "lightning", "lightning_fabric", "lightning_utilities", "omegaconf", "numpy", "pathlib",
     "typing", "argparse", "datetime",
@@ -49,7 +49,7 @@ _PLACEHOLDER_NAMES = {
 
 @dataclass(frozen=True)
 class StoredTensor:
-    """A tensor still in the file: elements of storage ``key`` from ``offset`` on, by ``shape`` and ``stride``."""
+    """Reference to a tensor in the file: elements of storage ``key`` from ``offset``, with ``shape`` and ``stride``."""
 
     key: str
     dtype: torch.dtype
@@ -63,13 +63,13 @@ class StoredTensor:
 
     @property
     def end(self) -> int:
-        """One past the last element of the storage that the tensor uses."""
+        """Index after the last element of the storage that the tensor uses."""
         last = sum((n - 1) * step for n, step in zip(self.shape, self.stride, strict=True))
         return self.offset + (last + 1 if self.n_elements else 0)
 
 
 class Ignored:
-    """Stands for an object that is not needed; takes whatever it is given and keeps nothing."""
+    """Placeholder of an object that is not needed; accepts and discards all arguments."""
 
     def __call__(self, *args, **kwargs):
         return self
@@ -81,7 +81,7 @@ class Ignored:
 
 
 class _Table(dict):
-    """A dictionary that takes no attributes: a state dict's are version numbers of its modules."""
+    """Dictionary that discards attributes; those of a state dict are version numbers of modules."""
 
     def __setstate__(self, state):
         pass
@@ -99,15 +99,15 @@ class _Unpickler(pickle.Unpickler):
         if full in _PLACEHOLDER_NAMES or module.split(".")[0] in _PLACEHOLDER_PACKAGES:
             return Ignored
         raise InputError(
-            f"{self.path}: refused, it asks for {full}, which is no part of a checkpoint's weights and could run code; "
-            "do not load this file with other programs either unless you trust where it comes from"
+            f"{self.path}: rejected: it references {full}, which is not part of a checkpoint's weights and could run "
+            "code; do not load this file with other programs either, unless you trust its source"
         )
 
     def persistent_load(self, pid: Any) -> tuple[str, torch.dtype]:
         match pid:
             case ("storage", torch.dtype() as dtype, str() as key, str(), int()):
                 return key, dtype
-        raise InputError(f"{self.path}: a tensor's storage is described in an unknown way: {shown(pid)}")
+        raise InputError(f"{self.path}: unknown description of a tensor's storage: {shown(pid)}")
 
 
 def _stored_tensor(storage, offset, shape, stride, *_) -> StoredTensor:
@@ -127,10 +127,14 @@ _KNOWN = {
 
 
 class ReleasedFile:
-    """An open file: ``content`` is its object with every tensor a :class:`StoredTensor`; ``read`` fetches one.
+    """An open file of ``torch.save``.
+
+    Attributes:
+        path: path of the file.
+        content: the stored object; its tensors are :class:`StoredTensor`, see :meth:`read`.
 
     Raises:
-        InputError: not such a file, broken, or it holds something that could run code; the message names the file.
+        InputError: the file is of another kind, damaged, or could run code; the message names it.
     """
 
     def __init__(self, path: str | Path):
@@ -158,12 +162,12 @@ class ReleasedFile:
         self._zip.close()
 
     def read(self, stored: StoredTensor) -> Tensor:
-        """The tensor's values; floating-point ones as float32."""
+        """Reads a tensor; floating-point values are converted to float32."""
         member = self._members.get(f"{self._root}data/{stored.key}")
         item = stored.dtype.itemsize
         available = member.file_size // item if member else 0
         if member is None or stored.end > available or stored.n_elements > available:
-            raise InputError(f"{self.path}: a tensor of {list(stored.shape)} does not fit its storage; it is broken")
+            raise InputError(f"{self.path}: damaged: a tensor of shape {list(stored.shape)} exceeds its storage")
         if stored.n_elements == 0:
             values = torch.zeros(stored.shape, dtype=stored.dtype)
         else:
@@ -175,18 +179,18 @@ class ReleasedFile:
         try:
             return self._zip.read(member)
         except BROKEN as error:
-            raise InputError(f"{self.path}: truncated or changed: {error or 'no memory'}") from None
+            raise InputError(f"{self.path}: truncated or changed: {error or 'out of memory'}") from None
 
     def _index(self) -> tuple[str, dict[str, zipfile.ZipInfo]]:
-        """The folder that everything is in, and the archive's members by name."""
+        """Returns the root folder in the archive, and its members by name."""
         members = {info.filename: info for info in self._zip.infolist()}
         roots = [name.removesuffix("data.pkl") for name in members if name.split("/")[1:] == ["data.pkl"]]
         if len(roots) != 1:
-            raise InputError(f"{self.path}: a zip archive, but not one that torch.save wrote: it holds no data.pkl")
+            raise InputError(f"{self.path}: a zip archive, but not of torch.save: it has no data.pkl")
         for info in members.values():
-            # Stored as they are, members cannot be larger than the file: nothing unpacks to more than the disk holds.
+            # Uncompressed members cannot be larger than the file, which excludes zip bombs.
             if info.compress_type != zipfile.ZIP_STORED or info.file_size != info.compress_size:
-                raise InputError(f"{self.path}: {info.filename} is compressed, which torch.save never does; refused")
+                raise InputError(f"{self.path}: rejected: {info.filename} is compressed, which torch.save never does")
         order = members.get(f"{roots[0]}byteorder")
         if order is not None and self._bytes_of(order) != b"little":
             raise InputError(f"{self.path}: written on a big-endian machine, which is not supported")
@@ -195,28 +199,28 @@ class ReleasedFile:
     def _unpickle(self) -> Any:
         info = self._members[f"{self._root}data.pkl"]
         if info.file_size > MAX_INDEX:
-            raise InputError(f"{self.path}: data.pkl has {info.file_size} bytes; more than {MAX_INDEX} are refused")
+            raise InputError(f"{self.path}: data.pkl has {info.file_size} bytes; at most {MAX_INDEX} are allowed")
         try:
             data = self._bytes_of(info)
             check_pickle(data)
             return _Unpickler(data, self.path).load()
         except InputError:
             raise
-        except Exception as error:  # a broken pickle raises anything
-            raise InputError(f"{self.path}: data.pkl is broken: {str(error)[:200]}") from None
+        except Exception as error:  # a damaged pickle can raise any exception
+            raise InputError(f"{self.path}: data.pkl is damaged: {str(error)[:200]}") from None
 
 
 def state_dict(file: ReleasedFile) -> tuple[dict[str, StoredTensor], dict[str, int]]:
-    """The weights of a Lightning checkpoint, or of a file of nothing but weights; and epoch and step, if given."""
+    """Returns the weights of a Lightning checkpoint or of a plain state dict, and its epoch and step if stored."""
     content = file.content
     if not isinstance(content, dict):
-        raise InputError(f"{file.path}: holds a {type(content).__name__}, not a checkpoint")
+        raise InputError(f"{file.path}: contains a {type(content).__name__}, not a checkpoint")
     weights = content.get("state_dict", content)
     if not isinstance(weights, dict) or not all(isinstance(name, str) for name in weights):
-        raise InputError(f"{file.path}: its state_dict is not a table of named tensors")
+        raise InputError(f"{file.path}: its state_dict is not a dictionary of named tensors")
     tensors = {name: value for name, value in weights.items() if isinstance(value, StoredTensor)}
     if not tensors:
         known = ", ".join(str(name)[:80] if isinstance(name, str) else shown(name) for name in list(content)[:8])
-        raise InputError(f"{file.path}: holds no weights: no state_dict, and no tensors; it has {known or 'nothing'}")
+        raise InputError(f"{file.path}: contains no weights: neither state_dict nor tensors, but {known or 'nothing'}")
     counts = {name: content[name] for name in ("epoch", "global_step") if type(content.get(name)) is int}
     return tensors, counts

@@ -1,4 +1,4 @@
-"""How the published model turns spherical harmonics."""
+"""Rotation of spherical harmonics as in the published model."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from torch.nn import functional as F
 
 from gsim3d.math.spherical_harmonics import rotate_harmonics
 
-AXIS_LIMIT = 1 - 1e-6  # of each component of the axis from which the published model derives its angles
+AXIS_LIMIT = 1 - 1e-6  # clamp of the axis components from which the published model derives Euler angles
 
 
 def rotate_released_harmonics(sh: Tensor, rotations: Tensor) -> Tensor:
-    """Predicted coefficients [N, K, C] turned into the world by ``rotations`` [N, 3, 3] as published weights expect it.
+    """Rotates predicted coefficients [N, K, C] to world space by ``rotations`` [N, 3, 3] as published weights expect.
 
-    They are in the published basis (the polar axis is y) and turn with matrices of another sign convention, so colours
-    do not turn with the particle, by a rotation that keeps 1e-3 rad away from turns about the y axis.
+    Coefficients are in the published basis (polar axis y), but are rotated by matrices of another sign convention, so
+    colours do not rotate with the particle. Rotations are kept 1e-3 rad away from those about the y axis.
     """
     return rotate_unpaired_harmonics(sh, clamp_polar_axis(rotations))
 
 
 def clamp_polar_axis(rotations: Tensor) -> Tensor:
-    """``rotations`` [N, 3, 3] as rebuilt from Euler angles (y, x, y) whose axis ``R y`` is clamped inside (-1, 1).
+    """Rebuilds ``rotations`` [N, 3, 3] from Euler angles (y, x, y) whose axis ``R y`` is clamped to (-1, 1).
 
-    Keeps 1.4e-3 rad away from rotations that map the y axis to itself. Written in sines and cosines: where the axis is
-    clamped, angles have no gradient or an infinite one.
+    Keeps 1.4e-3 rad away from rotations that map the y axis to itself. Uses sines and cosines, because angles have zero
+    or infinite gradients where the axis is clamped.
     """
     axis = F.normalize(rotations[..., 1], dim=-1).clamp(-AXIS_LIMIT, AXIS_LIMIT)
     x, y, z = axis.unbind(-1)
@@ -34,7 +34,7 @@ def clamp_polar_axis(rotations: Tensor) -> Tensor:
 
 
 def _unit_or_first(c: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-    """(c, s) over its length: cosine and sine of its angle; (1, 0), without a gradient, where it has no length."""
+    """Normalises (c, s) to length 1; returns (1, 0), without gradient, where the length is 0."""
     squared = c * c + s * s
     short = squared < torch.finfo(c.dtype).tiny
     length = torch.where(short, 1, squared).sqrt()
@@ -52,10 +52,10 @@ def _about_x(c: Tensor, s: Tensor) -> Tensor:
 
 
 def rotate_unpaired_harmonics(sh: Tensor, rotations: Tensor) -> Tensor:
-    """What the published model does with ``sh`` in its basis: the turned coefficients, in the standard basis.
+    """Rotates ``sh`` as the published model does; takes its basis, returns the standard basis.
 
-    Its basis is the standard one of (z, x, y) and equals that of its rotation matrices up to alternating signs, which
-    it leaves out.
+    The published basis is the standard one evaluated at (z, x, y). It differs from that of the published rotation
+    matrices by alternating signs, which the published model omits.
     """
     permute = published_axes(rotations)
     signs = torch.pow(-1.0, torch.arange(sh.shape[1], device=sh.device)).to(sh)[:, None]
@@ -64,5 +64,5 @@ def rotate_unpaired_harmonics(sh: Tensor, rotations: Tensor) -> Tensor:
 
 
 def published_axes(like: Tensor) -> Tensor:
-    """[3, 3]: (x, y, z) -> (z, x, y), the directions that the published renderer's harmonics are functions of."""
+    """Returns the permutation [3, 3] from (x, y, z) to (z, x, y), the argument of published harmonics."""
     return torch.eye(3, dtype=like.dtype, device=like.device)[[2, 0, 1]]

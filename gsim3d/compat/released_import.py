@@ -1,4 +1,4 @@
-"""A published checkpoint and its settings -> a model of this package, with every tensor accounted for."""
+"""Import of published checkpoints (``gsim3d import``), with validation of every tensor."""
 
 from __future__ import annotations
 
@@ -19,16 +19,17 @@ from gsim3d.io.files import new_output_path, read_yaml, with_parents
 from gsim3d.io.settings import to_dict
 from gsim3d.presets import ModelConfig
 
-MAX_NAMED = 8  # tensors that a message lists
+MAX_NAMED = 8  # tensors listed in a message
 
 
 @dataclass(frozen=True)
 class UntrainedSigns:
-    """Whether parts of a model never learned: see :func:`untrained_signs`.
+    """Result of :func:`untrained_signs`.
 
     Attributes:
-        blocks, n_blocks: attention-and-MLP blocks of the dynamics whose weights look as they were drawn, of all.
-        latent_heads: the same of the encoder's latent heads and their conditioning; None where it has none.
+        blocks: number of attention and MLP blocks of the dynamics whose weights look untrained.
+        n_blocks: number of all blocks.
+        latent_heads: whether the encoder's latent heads and their conditioning look untrained; None without heads.
     """
 
     blocks: int
@@ -38,23 +39,24 @@ class UntrainedSigns:
     def sentence(self) -> str:
         if self.blocks == 0 and not self.latent_heads:
             return "attention, MLP and latent heads have been trained"
-        heads = {True: "the latent heads too", False: "the latent heads have learned", None: "it has no latent heads"}
+        heads = {True: "so do the latent heads", False: "the latent heads were trained", None: "it has no latent heads"}
         return (
-            f"{self.blocks} of {self.n_blocks} attention and MLP blocks look as they were drawn at random, never "
-            f"trained; {heads[self.latent_heads]} (the published training could lose these gradients: see "
-            "docs/compat/migration.md)"
+            f"{self.blocks} of {self.n_blocks} attention and MLP blocks look untrained; {heads[self.latent_heads]} "
+            "(the published training could lose these gradients: see docs/compat/migration.md)"
         )
 
 
 @dataclass(frozen=True)
 class Imported:
-    """A published checkpoint as weights and configuration of this package.
+    """A converted published checkpoint.
 
     Attributes:
-        weights: of :class:`gsim3d.Simulator`.
-        n_parameters: published ones.
-        ignored: tensors that the model has not.
-        counts: epoch and global_step where the file tells them.
+        config: converted configuration.
+        weights: state dict of :class:`gsim3d.Simulator`.
+        n_parameters: number of published parameters.
+        ignored: names of tensors that the model does not have.
+        counts: epoch and global_step, if stored.
+        signs: untrained parts.
     """
 
     config: ReleasedConfig
@@ -66,11 +68,15 @@ class Imported:
 
 
 def import_released(path: str | Path, settings: dict) -> Imported:
-    """Reads a published checkpoint; ``settings`` is the mapping of its resolved YAML file.
+    """Reads and converts a published checkpoint.
+
+    Args:
+        path: checkpoint file.
+        settings: content of its resolved YAML file.
 
     Raises:
-        InputError: the file is not such a checkpoint or could run code, a setting is not supported, or tensors are
-            missing or have another shape than the settings say; the message names them.
+        InputError: the file is of another kind or could run code, a setting is not supported, or tensors are missing or
+            of the wrong shape; the message names them.
     """
     with ReleasedFile(path) as file:
         stored, counts = state_dict(file)
@@ -88,14 +94,14 @@ def import_released(path: str | Path, settings: dict) -> Imported:
 
 
 def published_shapes(config: ModelConfig) -> Shapes:
-    """Names and shapes that a published checkpoint of this model has; no memory is taken for it."""
+    """Returns the expected names and shapes of a published checkpoint, computed on the meta device."""
     with torch.device("meta"):
         weights = ReleasedSimulator(config).state_dict()
     return {name: tuple(value.shape) for name, value in to_published(weights, config).items()}
 
 
 def check_shapes(found: Shapes, expected: Shapes, where: Path) -> None:
-    """Raises InputError naming tensors that are missing or have another shape."""
+    """Raises InputError if tensors are missing or have the wrong shape; the message names them."""
     missing = [name for name in expected if name not in found and not name.endswith("num_batches_tracked")]
     wrong = [
         f"{name} is {list(found[name])} instead of {list(shape)}"
@@ -114,10 +120,10 @@ def _few(names: list[str]) -> str:
 
 
 def untrained_signs(published: dict[str, Tensor]) -> UntrainedSigns:
-    """Looks for weights that are still as an initialisation draws them.
+    """Detects weights that are still as initialised.
 
-    The published training could cut the gradients of attention, MLPs and latent heads. What never had a gradient keeps
-    norms of one constant with no bias, and uniform weights of at most 1 / sqrt(inputs), less where weight decay acted.
+    The published training could lose the gradients of attention, MLPs and latent heads. Untrained parts have norms with
+    constant weight and zero bias, and linear weights of at most 1 / sqrt(inputs), scaled down by weight decay.
     """
     blocks = {match[1] for name in published if (match := re.match(rf"{re.escape(DYNAMICS)}(.*\.block\d+)\.", name))}
     untrained = [block for block in blocks if _drawn_block(published, f"{DYNAMICS}{block}.")]
@@ -143,20 +149,21 @@ def _drawn_layer(published: dict[str, Tensor], prefix: str) -> bool:
 
 
 def write_imported(source: str | Path, settings_file: str | Path, out: str | Path) -> str:
-    """Imports a published checkpoint into the checkpoint folder ``out``; returns a report of what it held.
+    """Imports a published checkpoint into the checkpoint folder ``out``; returns a report.
 
     Args:
         source: checkpoint of the authors' release (.ckpt).
         settings_file: its resolved configuration (.yaml).
-        out: folder to write; must not exist yet.
+        out: folder to write; must not exist.
+
     Raises:
-        InputError: a file is none of the release, or its tensors and settings do not fit each other.
+        InputError: a file is not of the release, or tensors and settings do not match.
     """
     out, source, settings = new_output_path(out), Path(source), read_yaml(settings_file)
     try:
         imported = import_released(source, settings)
     except InputError as error:
-        # Messages about the file start with its name, about shapes with "weights", about settings with a key.
+        # Messages start with the file's name, with "weights:" (shapes), or with a key (settings).
         message = str(error).replace("weights:", f"{source}:", 1) if str(error).startswith("weights:") else str(error)
         raise InputError(message if message.startswith(str(source)) else f"{settings_file}: {message}") from None
     config, effects = imported.config, imported.config.effects
@@ -178,14 +185,14 @@ def _report(imported: Imported) -> str:
     trained = "".join(f", {name.replace('_', ' ')} {count}" for name, count in imported.counts.items())
     lines = [
         f"{imported.n_parameters:,} parameters{trained}",
-        f"{kind} model: {encoder.dynamic_dim} changing and {encoder.static_dim} fixed latents, history of "
-        f"{config.data['history']}, {encoder.n_depths} depths, cells of {dynamics.grid_size:g} m, images of "
+        f"{kind} model: {encoder.dynamic_dim} dynamic and {encoder.static_dim} static latents, history of "
+        f"{config.data['history']}, {encoder.n_depths} depths, grid size {dynamics.grid_size:g} m, images of "
         f"{config.data['image_size'][0]}x{config.data['image_size'][1]}",
         f"training: {imported.signs.sentence()}",
     ]
     lines += [f"note: {note}" for note in config.notes]
     if imported.ignored:
-        lines.append(f"tensors ignored, as the release does: {', '.join(imported.ignored)}")
+        lines.append(f"ignored tensors (also ignored by the release): {', '.join(imported.ignored)}")
     if config.ignored:
-        lines.append(f"settings that change nothing here: {', '.join(config.ignored)}")
+        lines.append(f"ignored settings (no effect in gsim3d): {', '.join(config.ignored)}")
     return "\n".join(lines)

@@ -1,7 +1,7 @@
-"""The published model: this one, but for what its weights were trained with.
+"""The published model as subclasses of gsim3d's modules, which reproduce the behaviour its weights were trained with.
 
-Each override below is one line of the release that :mod:`gsim3d` corrects; docs/compat/differences.md has the rest.
-:func:`as_released` gives the parts of a network the classes of this file, so that names of weights stay.
+Each override reproduces one behaviour of the release that :mod:`gsim3d` corrects; see docs/compat/differences.md for
+the others. :func:`as_released` changes the classes of the modules of a network, so that names of weights stay the same.
 """
 
 from __future__ import annotations
@@ -37,23 +37,26 @@ from gsim3d.presets import ModelConfig
 from gsim3d.simulator import Simulator
 from gsim3d.state import Gaussians
 
-HALF_MAX = torch.finfo(torch.float16).max  # beyond it half precision has infinity, and attention NaN
-NEAR_SHARE = 0.2  # of a camera's near bound: what is nearer is not drawn
-HARMONIC_14 = 1.445305721320277  # its factor
+HALF_MAX = torch.finfo(torch.float16).max  # larger values overflow in float16 and give NaN in attention
+NEAR_SHARE = 0.2  # near plane of the rasterizer, as a fraction of a camera's near bound
+HARMONIC_14 = 1.445305721320277  # normalisation factor of harmonic 14
 
 Module = TypeVar("Module", bound=nn.Module)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReleasedDynamicsConfig(DynamicsConfig):
-    """Cells are counted from the smallest position of a call and curves are as deep as its clouds are large, so clouds
-    change each other; time slots count from the first step; opacities have no upper limit; frozen particles keep their
-    place but not their orientation (with one step a call)."""
+    """Dynamics configuration of the release.
+
+    The grid origin and the depth of curves depend on all clouds of a call, so that clouds influence each other; time
+    slots count from the first step; opacities have no upper limit; frozen particles keep their position, but not their
+    orientation (with one step per call).
+    """
 
     def __post_init__(self):
         super().__post_init__()
         if self.background != "symmetric" or self.priors:
-            raise ValueError('ReleasedDynamicsConfig: background must be "symmetric", and nothing beside the network')
+            raise ValueError('ReleasedDynamicsConfig: background must be "symmetric", and there must be no priors')
 
     @property
     def origin_of_scene(self) -> bool:
@@ -74,10 +77,11 @@ class ReleasedDynamicsConfig(DynamicsConfig):
 
 @dataclass(frozen=True)
 class ReleasedModelConfig(ModelConfig):
-    """Sizes of the model of the published release.
+    """Model configuration of the release.
 
     Attributes:
-        release: True; a checkpoint's configuration says so by this key.
+        dynamics: dynamics configuration of the release.
+        release: True; marks the configuration in a checkpoint.
     """
 
     dynamics: ReleasedDynamicsConfig = field(default_factory=ReleasedDynamicsConfig)
@@ -85,20 +89,20 @@ class ReleasedModelConfig(ModelConfig):
 
 
 class ReleasedTransformer(MultiViewTransformer):
-    """With three or more views the mask of shifted windows is repeated along keys that are ordered position by
-    position, so it hides the wrong ones."""
+    """With three or more views, the mask of shifted windows is tiled by view although keys are ordered by position, so
+    it masks the wrong keys."""
 
     def cross_mask(self, mask: Tensor, n_views: int) -> Tensor:
         view = torch.arange(n_views, device=mask.device)
         position = torch.arange(mask.shape[1], device=mask.device)
         other = (view[:, None] + view[1:]) % n_views
-        rank = other - (other > view[:, None]).long()  # of a key view among the others of a query view
+        rank = other - (other > view[:, None]).long()  # index of a key view among the other views of a query view
         column = (position * (n_views - 1) + rank[..., None]) % len(position)  # [V, V - 1, L]
         return mask[:, :, column].permute(2, 0, 1, 3, 4).flatten(3)
 
 
 class ReleasedCostVolume(CostVolume):
-    """Feature pixel 0 lies at pixel coordinate 0 instead of its centre, and the plane sweep projects into a source view
+    """Feature pixel 0 is at image coordinate 0 instead of at its centre, and the plane sweep projects into source views
     with the intrinsics of the reference view."""
 
     def feature_intrinsics(self, Ks: Tensor) -> Tensor:
@@ -111,15 +115,15 @@ class ReleasedCostVolume(CostVolume):
 
 
 class ReleasedDepthPredictor(DepthPredictor):
-    """Coarse disparity and features are stretched from corner to corner."""
+    """Coarse disparity and features are upsampled with aligned corners."""
 
     def upsampling_stride(self, n: int) -> float:
         return (self.factor * n - 1) / max(1, n - 1)
 
 
 class ReleasedHeads(ParticleHeads):
-    """Depth means distance along the ray when particles are placed (the plane sweep means z); moments of viewing rays
-    are taken about the world's origin; harmonics turn as :func:`rotate_released_harmonics`."""
+    """Particles are placed at depth along the ray, although the plane sweep predicts z; Pluecker moments are about the
+    world origin; harmonics are rotated by :func:`rotate_released_harmonics`."""
 
     def forward(self, depth: Depth, views: Views, origin: Tensor) -> PixelParticles:
         return super().forward(depth, views, torch.zeros_like(origin))
@@ -132,14 +136,13 @@ class ReleasedHeads(ParticleHeads):
 
 
 class ReleasedSparseConv(point_transformer.SparseConv):
-    """Where rows share a cell, a convolution reads the lowest row of a neighbour cell, not the mean."""
+    """A convolution reads the first row of a cell with several rows, instead of their mean."""
 
     duplicates = "first"
 
 
 class ReleasedAttention(point_transformer.Attention):
-    """Queries, keys, values and results are rounded to half precision (beyond its range to its largest number, where
-    the release has infinity)."""
+    """Queries, keys, values and results are rounded to float16, clamped to its range (the release overflows)."""
 
     def forward(self, x: Tensor, patches: ops.PatchTable, row: int = 0, beside=None) -> Tensor:
         q, k, v = rounded_to_half(self.qkv(x)).unflatten(1, (3, self.heads, -1)).unbind(1)
@@ -147,14 +150,14 @@ class ReleasedAttention(point_transformer.Attention):
 
 
 class ReleasedDecoderStage(point_transformer.DecoderStage):
-    """The first convolution reads the skip branch before the features from below are added to it."""
+    """The first convolution reads the skip branch before the upsampled features are added."""
 
     def conv_input(self, x: Tensor, skip: Tensor) -> Tensor:
         return skip
 
 
 class ReleasedHead(GaussianHead):
-    """Predicted harmonics turn with the predicted rotation, as :func:`rotate_released_harmonics`."""
+    """Predicted harmonics are rotated by the predicted rotation, see :func:`rotate_released_harmonics`."""
 
     def _decoded(self, raw: Tensor, turns: None, n_harmonics: int) -> tuple[Tensor | None, Tensor, Tensor]:
         sh, quats, scales = widened(raw).split([raw.shape[1] - 7, 4, 3], 1)
@@ -185,7 +188,7 @@ COUNTERPARTS = {
 
 
 def as_released(network: Module, without: Collection[type] = ()) -> Module:
-    """``network``, whose modules have become those of this file; ``without``: but for these classes."""
+    """Changes the classes of the modules of ``network`` to those of this file, except classes in ``without``."""
     for module in network.modules():
         released = COUNTERPARTS.get(type(module))
         if released is not None and released not in without:
@@ -194,7 +197,7 @@ def as_released(network: Module, without: Collection[type] = ()) -> Module:
 
 
 class ReleasedSimulator(Simulator):
-    """A :class:`Simulator` that predicts what the published model predicts with the same weights."""
+    """A :class:`Simulator` that reproduces the predictions of the published model."""
 
     config_class = ReleasedModelConfig
     draws_in_graphs = False
@@ -207,7 +210,7 @@ class ReleasedSimulator(Simulator):
         spec = self.effects if spec is None else spec
         if spec.outputs.features or not spec.outputs.rgb:
             raise UnsupportedEffect(
-                "unsupported effect outputs: the published renderer draws colour and no features; leave it out"
+                "unsupported effect outputs: the published renderer renders colours only, no features"
             )
         return super().plan(spec)
 
@@ -216,13 +219,15 @@ class ReleasedSimulator(Simulator):
 
 
 def load_released(path: str | Path, *, device: str = "cpu") -> ReleasedSimulator:
-    """The simulator of a checkpoint that ``gsim3d import`` wrote.
+    """Loads a checkpoint of ``gsim3d import``.
 
     Args:
-        path: its folder or .safetensors file.
+        path: folder or .safetensors file.
         device: "cpu" or "cuda".
+
     Returns:
-        The simulator, in evaluation mode.
+        The simulator in evaluation mode.
+
     Raises:
         InputError: as :meth:`gsim3d.Simulator.from_pretrained`.
     """
@@ -230,23 +235,23 @@ def load_released(path: str | Path, *, device: str = "cpu") -> ReleasedSimulator
 
 
 def simulator_class(config: ModelConfig) -> type[Simulator]:
-    """The class of the simulator that ``config`` describes."""
+    """Returns the simulator class for ``config``."""
     return ReleasedSimulator if isinstance(config, ReleasedModelConfig) else Simulator
 
 
 def rounded_to_half(x: Tensor) -> Tensor:
-    wide = widened(x).clamp(-HALF_MAX, HALF_MAX)  # bfloat16 would round the bound up
-    # Gradients are not rounded: those beyond the range would become infinite.
+    wide = widened(x).clamp(-HALF_MAX, HALF_MAX)  # widened, because bfloat16 would round the bound up
+    # Straight-through gradients: rounding them to float16 could overflow.
     return (wide + (wide.half().to(wide) - wide).detach()).to(x.dtype)
 
 
 def render_released(
     gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None, *, jacobian: str = "clamped"
 ) -> Rendering:
-    """Images as the published renderer draws them, one by one.
+    """Renders images one by one as the published renderer does.
 
-    A Gaussian ends at the tiles that its three-sigma square touches; Gaussians nearer than a fifth of the camera's near
-    bound are culled; cameras keep their opening angles but look through the image's centre; colours are those of
+    Gaussians are cut off at the tiles of their three-sigma square, and culled nearer than a fifth of the camera's near
+    bound; cameras keep their field of view, but the principal point is centred; colours are those of
     :func:`released_colors`.
     """
     images = []
@@ -279,7 +284,7 @@ def render_released(
 
 
 def with_centered_principal_point(cameras: Cameras) -> Cameras:
-    """Cameras of the same opening angles, measured through the middles of opposite edges, with a centred view."""
+    """Returns cameras with equal fields of view, measured between edge midpoints, and centred principal points."""
     size = cameras.Ks.new_tensor([cameras.width, cameras.height], dtype=torch.float64)
     middle = torch.tensor([[[0, 0.5], [1, 0.5]], [[0.5, 0], [0.5, 1]]], dtype=torch.float64, device=size.device) * size
     pixels = F.pad(middle, (0, 1), value=1.0)  # [axis, edge, 3]
@@ -292,8 +297,10 @@ def with_centered_principal_point(cameras: Cameras) -> Cameras:
 
 
 def released_colors(sh: Tensor, means: Tensor, camera: Cameras) -> Tensor:
-    """[N, 3] colours of ``sh`` [N, K, 3] seen by one camera. The value of harmonic 14 has z where the harmonic has y
-    (published axes); its gradient is the true one."""
+    """Evaluates colours [N, 3] of ``sh`` [N, K, 3] for one camera.
+
+    As in the release, the value of harmonic 14 uses z instead of y (published axes), but its gradient is the true one.
+    """
     pose = torch.linalg.inv(camera.viewmats[0].double())[:3, 3].to(means)
     directions = F.normalize(means - pose, dim=1)
     colors = torch.einsum("nk,nkc->nc", sh_basis(directions, math.isqrt(sh.shape[1]) - 1), sh) + 0.5

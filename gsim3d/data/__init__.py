@@ -1,4 +1,4 @@
-"""Readers of recorded scenes, splits, windows, and the packing of images into Frames."""
+"""Dataset readers, train/test splits, windows of steps, and packing of images into Frames."""
 
 from gsim3d.data.dataset import Window, generator, make_frames, published_split, split_scenes
 from gsim3d.data.fitting import Fitting

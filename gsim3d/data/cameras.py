@@ -1,6 +1,6 @@
-"""Checks of cameras in one convention, and quantities that follow from cameras alone.
+"""Validation of camera poses and intrinsics, and scene extents derived from cameras.
 
-Everything here is float64, world-to-camera, OpenCV axes (x right, y down, z forward), pixel centres at +0.5.
+All poses are float64, world-to-camera, OpenCV axes (x right, y down, z forward), pixel centres at +0.5.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from gsim3d.math.rotations import rotation_matrices
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera axes (y up, z backwards) <-> OpenCV's
 ROTATION_TOLERANCE = 1e-3
-MIN_FOCAL = 1e-3  # pixels; shorter ones make rays that overflow
-NORMALISED_FOCAL = 8.0  # pixels; a focal length below it, of an image larger than it, is no focal length in pixels
-MAX_ERROR = 0.5  # of axes that meet: their distance from the point over its distance
-MIN_SPREAD = 0.02  # mean squared sine of the optical axes around their mean: about 8 degrees
-MANY_STEPS = 64  # of moving cameras; so many show where they look
-NEAR_SHARE, FAR_SHARE = 0.3, 2.0  # near and far relative to the distances of the point that the cameras look at
-FAR_FROM_ZERO = 16  # near depths; farther away float32 moves near points by more than 2^-20 of their depth
-MAX_REACH = 1000  # times far: how far away from the cameras the lower corner of the workspace may lie
+MIN_FOCAL = 1e-3  # pixels; smaller values overflow in ray directions
+NORMALISED_FOCAL = 8.0  # pixels; smaller focal lengths of larger images are taken to be divided by the image size
+MAX_ERROR = 0.5  # RMS distance of the optical axes from their focus point, over the mean camera distance
+MIN_SPREAD = 0.02  # smallest mean squared sine between the axes and their mean direction: about 8 degrees
+MANY_STEPS = 64  # steps of moving cameras that checks and extents use
+NEAR_SHARE, FAR_SHARE = 0.3, 2.0  # near and far, as multiples of the smallest and largest distance to the focus point
+FAR_FROM_ZERO = 16  # times near; beyond it float32 rounds positions at depth near by more than 2^-20 of their depth
+MAX_REACH = 1000  # times far; largest distance from the cameras to the lower corner of the workspace
 SAMPLES = 12  # points along each side of a frustum
 
 
 def inverse(viewmats: np.ndarray) -> np.ndarray:
-    """Inverses [..., 4, 4] of rigid motions: camera-to-world from world-to-camera, or back."""
+    """Returns the inverses of rigid transforms [..., 4, 4]: world-to-camera to camera-to-world, or the reverse."""
     result = np.zeros_like(viewmats)
     rotation = viewmats[..., :3, :3].swapaxes(-1, -2)
     result[..., :3, :3] = rotation
@@ -39,10 +39,10 @@ def inverse(viewmats: np.ndarray) -> np.ndarray:
 
 
 def near_zero(recording: Recording) -> Recording:
-    """``recording`` with positions that float32 holds.
+    """Returns ``recording`` translated towards the origin if its coordinates are too large for float32.
 
-    Where cameras lie far from 0 for what they see, as in survey coordinates, positions count from a ``world_offset``
-    amid them, in whole metres.
+    Georeferenced scenes, for example, have cameras millions of metres from the origin. The translation is the mean
+    camera centre, rounded to metres; it is added to ``world_offset``.
     """
     middle = inverse(recording.viewmats)[..., :3, 3].reshape(-1, 3).mean(0)
     near = recording.near or min(depth_range(spread_steps(recording.viewmats).reshape(-1, 4, 4)) or (np.inf,))
@@ -56,12 +56,12 @@ def near_zero(recording: Recording) -> Recording:
 
 
 def rotations(quaternions: np.ndarray) -> np.ndarray:
-    """Rotation matrices [S, 3, 3] of unit quaternions (w, x, y, z) [S, 4]."""
+    """Returns the rotation matrices [S, 3, 3] of unit quaternions (w, x, y, z) [S, 4]."""
     return rotation_matrices(torch.from_numpy(quaternions)).numpy()
 
 
 def check_pose(matrices: np.ndarray, what: str, problems: Problems) -> bool:
-    """Whether [4, 4] or [S, 4, 4] are rigid motions of right-handed axes; names the frame of the first that is not."""
+    """Returns whether [4, 4] or [S, 4, 4] are right-handed rigid transforms; reports the first frame that is not."""
     stack = matrices.reshape(-1, 4, 4)
     rotation = stack[:, :3, :3]
     end = np.abs(stack[:, 3] - [0, 0, 0, 1]).max(1)
@@ -74,17 +74,17 @@ def check_pose(matrices: np.ndarray, what: str, problems: Problems) -> bool:
         reason = f"must end in the row 0 0 0 1; got {stack[step, 3].tolist()}"
     elif skew[step] > ROTATION_TOLERANCE:
         reason = (
-            f"must be a rigid motion: its rotation is not orthonormal (off by {skew[step]:.3g}); it holds a scale or "
-            "shear, or is cut off"
+            f"must be a rigid transform: its rotation is not orthonormal (off by {skew[step]:.3g}); it contains scale "
+            "or shear, or its numbers have too few digits"
         )
     else:
-        reason = "must be a rigid motion: its rotation is left-handed (determinant -1); one axis is mirrored"
+        reason = "must be a rigid transform: its rotation is left-handed (determinant -1); one axis is mirrored"
     problems.add(f"{what}{f' (frame {step})' if matrices.ndim == 3 else ''} {reason}")
     return False
 
 
 def check_intrinsics(Ks: np.ndarray, size: tuple[int, int], what: str, problems: Problems) -> bool:
-    """Whether [3, 3] or [S, 3, 3] are pinhole intrinsics in pixels of an image of ``size``."""
+    """Returns whether [3, 3] or [S, 3, 3] are valid pinhole intrinsics, in pixels, of images of ``size``."""
     moving = Ks.ndim == 3
     for step, K in enumerate(Ks if moving else Ks[None]):
         which = f"{what}{f' (frame {step})' if moving else ''}"
@@ -109,12 +109,12 @@ def check_intrinsics(Ks: np.ndarray, size: tuple[int, int], what: str, problems:
 
 
 def positions_and_axes(viewmats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Camera centres and optical axes in the world, [..., 3] each."""
+    """Returns camera centres and optical axes in world space, [..., 3] each."""
     return inverse(viewmats)[..., :3, 3], viewmats[..., 2, :3]
 
 
 def focus(viewmats: np.ndarray) -> np.ndarray | None:
-    """The point [3] nearest to all optical axes of [N, 4, 4]; None where the axes are nearly parallel."""
+    """Returns the point [3] closest to the optical axes of [N, 4, 4] by least squares; None if they are parallel."""
     centres, axes = positions_and_axes(viewmats)
     across = np.eye(3) - axes[:, :, None] * axes[:, None]
     if len(axes) < 2 or np.linalg.eigvalsh(across.mean(0))[0] < MIN_SPREAD:
@@ -124,12 +124,12 @@ def focus(viewmats: np.ndarray) -> np.ndarray | None:
 
 @dataclass(frozen=True)
 class _Convergence:
-    """How cameras look at the point nearest to all their axes.
+    """Statistics of cameras relative to their focus point, the point closest to all optical axes.
 
     Attributes:
-        behind: bool [N], cameras that have it behind them.
-        error: distance of the axes from it over its distance.
-        plausible: share of the cameras that have it before them at a distance that a scene may have.
+        behind: bool [N], whether the focus point lies behind a camera.
+        error: RMS distance of the axes from the focus point, over the mean camera distance.
+        plausible: fraction of the cameras with the focus point in front of them, at a plausible distance.
     """
 
     behind: np.ndarray
@@ -138,12 +138,12 @@ class _Convergence:
 
     @property
     def fits(self) -> bool:
-        """Whether all cameras look at one point."""
+        """Whether all cameras look at the focus point."""
         return self.plausible == 1 and self.error < MAX_ERROR
 
 
 def check_directions(recording: Recording, problems: Problems) -> None:
-    """Finds flipped axes and exchanged directions, which no single matrix shows: cameras look at one scene."""
+    """Detects flipped camera axes and inverted poses by testing whether the cameras look at one common scene."""
     viewmats, source = spread_steps(recording.viewmats), recording.source
     _check_origin(recording, viewmats.reshape(-1, 4, 4), problems)
     if recording.bounds is not None:
@@ -156,19 +156,19 @@ def check_directions(recording: Recording, problems: Problems) -> None:
     hint = _better_convention(viewmats.reshape(-1, 4, 4), depths)
     if found.behind.all() or (hint and (found.plausible < 0.5 or found.error > MAX_ERROR)):
         hint = hint or "are the camera axes OpenGL's (y up, z backwards)?"
-        problems.add(f"{source}: the cameras look away from one another's views: {hint}")
+        problems.add(f"{source}: the cameras do not look at a common point: {hint}")
         return
     behind = found.behind.reshape(viewmats.shape[:2])
     for cam in np.flatnonzero(behind.any(0)):
         frame = f", frame {int(np.argmax(behind[:, cam]))}" if len(viewmats) > 1 else ""
         problems.add(
             f"{source}: camera {recording.camera_names[cam]}{frame} looks away from the point that the others look at: "
-            "are its y and z axes flipped? (if it is right, give the bounds of the scene)"
+            "are its y and z axes flipped? (if the pose is correct, give the bounds of the scene)"
         )
 
 
 def _check_origin(recording: Recording, viewmats: np.ndarray, problems: Problems) -> None:
-    """Voxels are counted from the origin: far from it float32 cannot separate them."""
+    """Reports an origin too far from the cameras: float32 coordinates relative to it would be too coarse."""
     key = "bounds" if recording.origin is None else "origin"
     corner = recording.bounds[0] if recording.origin is None and recording.bounds is not None else recording.origin
     if corner is None:
@@ -178,12 +178,12 @@ def _check_origin(recording: Recording, viewmats: np.ndarray, problems: Problems
     if distance > MAX_REACH * far:
         problems.add(
             f"{recording.source}: {key} lies {distance:.3g} m from the nearest camera, though far is {far:.3g} m; it "
-            "must be the lower corner of the box in which the scene happens"
+            "must be the lower corner of the box that contains the scene"
         )
 
 
 def _convergence(viewmats: np.ndarray, depths: tuple[float | None, float | None]) -> _Convergence | None:
-    """None where the axes are nearly parallel. ``depths``: near and far, None where they are not given."""
+    """Returns None if the axes are nearly parallel. ``depths`` are near and far, None if not given."""
     point = focus(viewmats)
     if point is None:
         return None
@@ -192,7 +192,7 @@ def _convergence(viewmats: np.ndarray, depths: tuple[float | None, float | None]
     depth = (to_point * axes).sum(1)
     distance = np.linalg.norm(to_point, axis=1)
     off = np.sqrt(np.maximum(distance**2 - depth**2, 0))
-    # Cameras read the wrong way round often have nearly one position, where their axes meet too.
+    # Inverted poses often place all cameras at nearly one position, where their axes meet too.
     least = 0.2 * np.linalg.norm(viewmats[:, :3, 3], axis=1).mean() if depths[0] is None else depths[0] / 2
     most = np.inf if depths[1] is None else 2 * depths[1]
     plausible = (depth > 0) & (distance >= least) & (distance <= most)
@@ -201,7 +201,7 @@ def _convergence(viewmats: np.ndarray, depths: tuple[float | None, float | None]
 
 
 def _better_convention(viewmats: np.ndarray, depths: tuple[float | None, float | None]) -> str | None:
-    """The convention of the matrices, as a question, in which all cameras look at one point; None: there is none."""
+    """Returns a question naming the convention in which all cameras look at one point; None if no convention fits."""
     readings = {
         "are the camera axes OpenGL's (y up, z backwards) where OpenCV's are expected, or the reverse?": OPENGL
         @ viewmats,
@@ -224,19 +224,23 @@ def _check_view_of_bounds(recording: Recording, viewmats: np.ndarray, problems: 
     seen = _visible(low + grid * (high - low), viewmats, Ks, sizes).any((0, 2))
     for cam in np.flatnonzero(~seen):
         problems.add(
-            f"{recording.source}: camera {recording.camera_names[cam]} sees nothing of the bounds {low.tolist()} to "
+            f"{recording.source}: camera {recording.camera_names[cam]} does not see the bounds {low.tolist()} to "
             f"{high.tolist()}: are its y and z axes flipped, or is its matrix camera-to-world?"
         )
 
 
 def spread_steps(values: np.ndarray) -> np.ndarray:
-    """At most MANY_STEPS of the steps of [S, ...], evenly spread."""
+    """Subsamples [S, ...] to at most MANY_STEPS evenly spaced steps."""
     chosen = np.linspace(0, len(values) - 1, min(len(values), MANY_STEPS)).round().astype(int)
     return values[chosen]
 
 
 def project(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels [..., N, 2] and depths [..., N] of world points [N, 3] in cameras [..., 4, 4], [..., 3, 3]."""
+    """Projects world points [N, 3] with viewmats [..., 4, 4] and Ks [..., 3, 3].
+
+    Returns:
+        Pixels [..., N, 2] and depths [..., N].
+    """
     local = points @ viewmats[..., :3, :3].swapaxes(-1, -2) + viewmats[..., None, :3, 3]
     image = local @ Ks.swapaxes(-1, -2)
     depth = local[..., 2]
@@ -244,13 +248,13 @@ def project(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> tuple[n
 
 
 def _visible(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """bool [S, V, N], points in front of a camera and inside its image."""
+    """Returns bool [S, V, N]: whether points project in front of a camera and inside its image."""
     pixels, depth = project(points, viewmats, Ks)
     return (depth > 0) & (pixels >= 0).all(-1) & (pixels <= sizes[:, None]).all(-1)
 
 
 def depth_range(viewmats: np.ndarray) -> tuple[float, float] | None:
-    """near and far around the point that cameras [N, 4, 4] look at; None where there is no such point."""
+    """Estimates near and far from the distances of cameras [N, 4, 4] to their focus point; None without one."""
     point = focus(viewmats)
     if point is None:
         return None
@@ -259,7 +263,7 @@ def depth_range(viewmats: np.ndarray) -> tuple[float, float] | None:
 
 
 def frusta_points(viewmats, Ks, sizes: Sequence[tuple[int, int]], near: float, far: float, samples: int) -> np.ndarray:
-    """World points [S, V, samples^3, 3] on a grid inside the frusta of cameras [S, V, ...], corners included."""
+    """Returns world points [S, V, samples^3, 3] on a grid in the frusta of cameras [S, V, ...], corners included."""
     share = np.linspace(0, 1, samples)
     grid = np.stack(np.meshgrid(share, share, 1 / np.linspace(1 / near, 1 / far, samples), indexing="ij"), -1)
     grid = grid.reshape(-1, 3)
@@ -272,12 +276,12 @@ def frusta_points(viewmats, Ks, sizes: Sequence[tuple[int, int]], near: float, f
 
 
 def frusta_origin(viewmats, Ks, sizes: Sequence[tuple[int, int]], near: float, far: float) -> np.ndarray:
-    """Lower corner, float64 [3], of the box around all camera frusta between ``near`` and ``far``."""
+    """Returns the lower corner, float64 [3], of the bounding box of all frusta between ``near`` and ``far``."""
     return frusta_points(viewmats, Ks, sizes, near, far, 2).reshape(-1, 3).min(0)
 
 
 def shared_view(viewmats, Ks, sizes: Sequence[tuple[int, int]], near: float, far: float) -> np.ndarray:
-    """Box [2, 3] around what most cameras see at one step: the default of a scene's bounds."""
+    """Returns the bounding box [2, 3] of the region that most cameras see at the first step; default scene bounds."""
     points = frusta_points(viewmats[:1], Ks[:1], sizes, near, far, SAMPLES)[0].reshape(-1, 3)
     seen_by = _visible(points, viewmats[:1], Ks[:1], np.asarray(sizes, dtype=np.float64))[0].sum(0)
     shared = points[seen_by >= 0.75 * seen_by.max()]

@@ -1,4 +1,4 @@
-"""Everything that is wrong with a scene folder, and a picture that shows whether its cameras are right."""
+"""Validation of a scene folder, and a contact sheet that shows whether its cameras are correct."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from gsim3d.data.scene import Scene
 from gsim3d.errors import InputError
 from gsim3d.io.terminal import plain
 
-SHEET = 1440  # pixels, aimed width of the sheet
-TILE = 200, 420  # pixels, smallest and largest height of one frame in it
+SHEET = 1440  # pixels, target width of the contact sheet
+TILE = 200, 420  # pixels, smallest and largest height of one frame
 GAP, LINE = 6, 22  # pixels between frames, and height of a line of text
-MAX_CAMERAS, MAX_SCENES = 6, 6  # shown of each scene, and of a data set; evenly spread
-MAX_COORDINATE = 8000.0  # pixels; lines that leave a frame by more are cut
+MAX_CAMERAS, MAX_SCENES = 6, 6  # shown per scene and per data set, evenly spaced
+MAX_COORDINATE = 8000.0  # pixels; projected points are clipped to it
 BOX, BODY, MASK, CAMERA = (255, 220, 60), (0, 140, 255), (0, 235, 255), (255, 90, 255)  # blue, green, red
 AXES = {"x": (60, 60, 255), "y": (70, 220, 70), "z": (255, 120, 60)}
 INK, PAPER, MISSING = (40, 40, 40), (255, 255, 255), (190, 190, 190)
 EDGE_POINTS = 24
-TEXT = 0.42  # size of letters, as OpenCV measures it
-HULL_GRID = 24  # points along each side of a box that is searched for moving bodies
-HULL_STEPS = 3  # where the masks are compared in space
+TEXT = 0.42  # OpenCV font scale
+HULL_GRID = 24  # grid points along each axis of a visual hull
+HULL_STEPS = 3  # steps at which visual hulls are computed
 EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).bit_count() == 1]
 
 
 @dataclass(frozen=True)
 class SceneCheck:
-    """Result of reading everything in a scene folder.
+    """Result of :func:`check_scene`.
 
     Attributes:
-        path: folder.
-        scene: None where it could not be opened.
-        problems: one line each, in the order in which they were found.
+        path: scene folder.
+        scene: the opened scene; None if it could not be opened.
+        problems: one message per line, in the order found.
     """
 
     path: Path
@@ -46,7 +46,7 @@ class SceneCheck:
 
 
 def check_scene(folder: str | Path) -> SceneCheck:
-    """Everything that is wrong with a scene folder, of which every image is read."""
+    """Reads every image of a scene folder and returns all problems found."""
     path, problems = Path(folder), Problems(collect=True)
     recording = scene = None
     try:
@@ -65,7 +65,7 @@ def check_scene(folder: str | Path) -> SceneCheck:
         if recording.read_labels is not None:
             _check_labels(recording, problems)
     if scene is not None and not problems.found:
-        _check_agreement(Scene(path, recording), problems)  # its images go when it goes
+        _check_agreement(Scene(path, recording), problems)  # a second Scene, so that its decoded images are freed
     return SceneCheck(path, scene, tuple(dict.fromkeys(problems.found)))
 
 
@@ -85,29 +85,31 @@ def _check_labels(recording: Recording, problems: Problems) -> None:
             problems.add(f"camera {name}: {error}")
     if MOVING not in seen and len(problems.found) == before:
         problems.add(
-            f"{recording.source}: no label image has a pixel of {MOVING}, a body that may move; found {sorted(seen)}"
+            f"{recording.source}: no label image has a pixel of value {MOVING} (movable body); found {sorted(seen)}"
         )
 
 
 def _check_agreement(scene: Scene, problems: Problems) -> None:
-    """Moving bodies lie where the views of the cameras cross: with wrong poses there is no such region."""
+    """Reports an empty visual hull of the moving bodies, which indicates wrong poses."""
     if not scene.has_segmentation() or scene.n_cams < 2:
         return
     hulls = [moving_box(scene, step) for step in _spread(scene.n_steps, HULL_STEPS)]
     compared = [box for box, n_cams in hulls if n_cams > 1]
     if compared and all(box is None for box in compared):
         problems.add(
-            f"{scene.recording.source}: the moving bodies in the masks of the cameras have no common position: a pose, "
-            "an intrinsic or the order of the cameras is wrong, or the bounds are (see the picture)"
+            f"{scene.recording.source}: the moving bodies in the masks of the cameras have no common position: poses, "
+            "intrinsics, the order of the cameras or the bounds are wrong (see the contact sheet)"
         )
 
 
 def moving_box(scene: Scene, step: int) -> tuple[np.ndarray | None, int]:
-    """Box [2, 3] around a step's moving bodies, and how many cameras see one.
+    """Computes the bounding box of the visual hull of the moving bodies at a step.
 
-    The box holds the points that lie on a moving body for all cameras that see them; None where there are none. Points
-    are tried on a grid in the scene's bounds, then on a finer one around those that were found; masks are widened by
-    half a cell.
+    A grid point is in the hull if it projects into the moving mask of every camera that sees it. The grid covers the
+    scene's bounds, then is refined around the points found; masks are dilated by half a cell.
+
+    Returns:
+        Box [2, 3], None if the hull is empty, and the number of cameras whose mask has a moving body.
     """
     labels = scene.segmentation(range(scene.n_cams), [step])[0].numpy()
     seeing = np.flatnonzero((labels == MOVING).any((1, 2)))
@@ -117,7 +119,7 @@ def moving_box(scene: Scene, step: int) -> tuple[np.ndarray | None, int]:
 
 
 def _common_box(scene: Scene, step: int, labels: np.ndarray, seeing: np.ndarray, box: np.ndarray) -> np.ndarray | None:
-    """Box around the grid points in ``box`` that lie on a moving body for the cameras ``seeing``."""
+    """Returns the bounding box of the grid points in ``box`` inside the moving masks of the cameras ``seeing``."""
     import cv2
 
     recording = scene.recording
@@ -133,7 +135,7 @@ def _common_box(scene: Scene, step: int, labels: np.ndarray, seeing: np.ndarray,
         if not seen.any():
             continue
         radius = int(np.ceil(Ks[cam, 0, 0] * np.linalg.norm(cell) / 2 / np.median(depth[seen])))
-        radius = min(radius, max(width, height))  # all of the image; wrong calibration gives any radius
+        radius = min(radius, max(width, height))  # a wrong calibration can give any radius
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
         mask = cv2.dilate((labels[cam] == MOVING).astype(np.uint8), disc) > 0
         inside[seen] &= mask[index[seen, 1], index[seen, 0]]
@@ -143,16 +145,16 @@ def _common_box(scene: Scene, step: int, labels: np.ndarray, seeing: np.ndarray,
 
 
 def describe(scene: Scene) -> str:
-    """One line on a scene."""
+    """Returns a one-line summary of a scene."""
     size = " x ".join(f"{side:.2g}" for side in scene.bounds[1] - scene.bounds[0])
     sizes = sorted(set(scene.recording.sizes))
     pixels = ", ".join(f"{width}x{height}" for width, height in sizes[:2]) + (", ..." if len(sizes) > 2 else "")
     moves = ", moving" if len(scene.recording.viewmats) > 1 else ""
     labels = "subtracted" if scene.recording.subtract_background else "yes" if scene.has_segmentation() else "none"
     offset = ", ".join(f"{x:.0f}" for x in scene.world_offset) if scene.world_offset.any() else None
-    where = "" if offset is None else f", positions count from ({offset})"
+    where = "" if offset is None else f", world offset ({offset})"
     return (
-        f"{scene.name}: {scene.layout}, {scene.n_steps} steps at {scene.fps:g} a second, "
+        f"{scene.name}: {scene.layout}, {scene.n_steps} steps at {scene.fps:g} fps, "
         f"{scene.n_cams} cameras{moves}, "
         f"{pixels} pixels, depth {scene.near:.2f} to {scene.far:.2f} m, bounds {size} m{where}, "
         f"masks: {labels}" + "".join(f"; {note}" for note in scene.recording.notes)
@@ -160,14 +162,14 @@ def describe(scene: Scene) -> str:
 
 
 def contact_sheet(scenes: Sequence[Scene]) -> np.ndarray:
-    """Frames of some cameras at some steps of some scenes, with cameras, boxes and masks drawn on top.
+    """Draws sample frames of the scenes with their bounds, cameras and masks.
 
-    The blue box is the scene's bounds, the orange one is where all cameras see a moving body; the arrows are the
-    world's x, y and z axes (red, green, blue) at the middle of the lower face of the bounds; magenta squares are the
-    other cameras; the yellow line is the outline of what is not background.
+    Blue box: the scene's bounds. Orange box: the visual hull of the moving bodies. Arrows: the world's x, y and z axes
+    (red, green, blue) at the centre of the lower face of the bounds. Magenta squares: the other cameras. Yellow:
+    outline of the foreground.
 
     Returns:
-        uint8 [H, W, 3], blue first.
+        uint8 [H, W, 3], BGR.
     """
     shown = [scenes[i] for i in _spread(len(scenes), MAX_SCENES)]
     blocks = []
@@ -181,8 +183,8 @@ def contact_sheet(scenes: Sequence[Scene]) -> np.ndarray:
             body = _try(lambda: moving_box(scene, step)[0] if scene.has_segmentation() else None)
             blocks.append(_side_by_side([_tile(scene, cam, step, tile_height, body) for cam in cams]))
     legend = (
-        "blue box: bounds of the scene; orange box: where all cameras see what moves; red, green, blue: x, y, z of the "
-        "world; magenta: other cameras; yellow: masks"
+        "blue box: scene bounds; orange box: visual hull of moving bodies; red, green, blue: world x, y, z; "
+        "magenta: other cameras; yellow: masks"
     )
     blocks.append(_text(legend))
     width = max(block.shape[1] for block in blocks)
@@ -235,7 +237,7 @@ def _draw_scene(tile: np.ndarray, scene: Scene, cam: int, step: int, zoom: float
     viewmat, K = viewmats[cam], np.diag([zoom, zoom, 1.0]) @ Ks[cam]
 
     def line(start: np.ndarray, end: np.ndarray, color: tuple, thickness: int) -> np.ndarray | None:
-        """Draws the part in front of the camera. Returns the pixel at which the line ends, None behind the camera."""
+        """Draws the part in front of the camera. Returns the end pixel, None if it is behind the camera."""
         pixels, depth = project(start + np.linspace(0, 1, EDGE_POINTS)[:, None] * (end - start), viewmat, K)
         pixels = pixels.clip(-MAX_COORDINATE, MAX_COORDINATE).round().astype(int)
         for i in np.flatnonzero((depth[:-1] > 1e-3) & (depth[1:] > 1e-3)):

@@ -1,8 +1,8 @@
-"""COLMAP's sparse models, text or binary: cameras and images, and points3D for the depth range.
+"""Reader of COLMAP sparse models, text or binary: cameras, images, and points3D for the depth range.
 
-All models of cameras but FOV and thin prisms are read. With fps in scene.json the last number of an image's name is its
-time in frames and the rest names its camera; without, each image is a camera of one instant. Lengths are in units of
-the model. All keys: docs/reference/data.md.
+All camera models are supported except FOV and thin prism. If scene.json gives fps, the last number in an image's name
+is its frame number and the rest names its camera; otherwise each image is its own camera at a single step. Lengths are
+in model units. All keys: docs/reference/data.md.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ NAME = "colmap"
 FILE = "sparse/0"
 FOLDERS = (FILE, "sparse", "colmap/sparse/0", ".")
 SETTINGS = "scene.json"
-MODELS = (  # in the order of their numbers in binary files
+MODELS = (  # indexed by COLMAP's model id
     ("SIMPLE_PINHOLE", "f cx cy"), ("PINHOLE", "fl_x fl_y cx cy"), ("SIMPLE_RADIAL", "f cx cy k1"),
     ("RADIAL", "f cx cy k1 k2"), ("OPENCV", "fl_x fl_y cx cy k1 k2 p1 p2"),
     ("OPENCV_FISHEYE", "fl_x fl_y cx cy k1 k2 k3 k4"), ("FULL_OPENCV", "fl_x fl_y cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
     ("FOV", ""), ("SIMPLE_RADIAL_FISHEYE", "f cx cy k1"), ("RADIAL_FISHEYE", "f cx cy k1 k2"),
     ("THIN_PRISM_FISHEYE", ""), ("RAD_TAN_THIN_PRISM_FISHEYE", ""),
 )  # fmt: skip
-MAX_LINE, MAX_PATH = 1 << 25, 4096  # bytes of a line of text, and of the name of an image
+MAX_LINE, MAX_PATH = 1 << 25, 4096  # bytes of a text line, and of an image name
 MAX_ENTRIES = 100_000
-MAX_POINTS, FEW_POINTS = 3_000_000, 20_000  # read, and projected
-MIN_SEEN = 8  # points; depths of cameras that see fewer are not used
-QUANTILES, MARGINS = (0.01, 0.99), (0.8, 1.2)  # of the depths of points
+MAX_POINTS, FEW_POINTS = 3_000_000, 20_000  # points read, and points projected
+MIN_SEEN = 8  # points; cameras that see fewer do not contribute depths
+QUANTILES, MARGINS = (0.01, 0.99), (0.8, 1.2)  # near and far: quantiles of point depths, times margins
 QUATERNION_TOLERANCE = 1e-2
 
 
 def recognises(folder: Path) -> bool:
-    """Whether ``folder`` has a sparse model."""
+    """Returns whether ``folder`` has a sparse model."""
     return _model_of(folder) is not None
 
 
 def read(folder: Path, problems: Problems) -> Recording:
-    """The scene in ``folder``. Raises InputError where its description cannot be read at all."""
+    """Reads the scene in ``folder``. Raises InputError if its description cannot be parsed."""
     model = _model_of(folder)
     settings = read_json(folder / SETTINGS) if (folder / SETTINGS).is_file() else {}
     fps = Description(settings, f"{folder / SETTINGS}: ", problems).positive("fps")
@@ -56,13 +56,13 @@ def read(folder: Path, problems: Problems) -> Recording:
     frames = []
     for name, camera, quaternion, translation in _bounded(_images(source), model):
         if camera not in cameras:
-            raise InputError(f"{source}: image {name} is of camera {camera}, which is not in {_file(model, 'cameras')}")
+            raise InputError(f"{source}: image {name} has camera {camera}, which is not in {_file(model, 'cameras')}")
         pose = inverse(_viewmat(quaternion, translation, f"{source}: image {name}")) @ OPENGL
         frame = {"file_path": f"images/{name}", "transform_matrix": pose, **cameras[camera]}
         if fps is not None:
             number = trailing_number(PurePosixPath(name).stem)
             if number is None:
-                raise InputError(f"{source}: image {name} has no number, which is its time where {SETTINGS} has fps")
+                raise InputError(f"{source}: image {name} has no frame number, needed because {SETTINGS} gives fps")
             frame["time"] = number / fps
         frames.append(frame)
     if len({frame["file_path"] for frame in frames}) < len(frames):
@@ -72,10 +72,10 @@ def read(folder: Path, problems: Problems) -> Recording:
     if recording.near is None or recording.far is None:
         near, far = _depths(model, recording) or (None, None)
         recording = dataclasses.replace(recording, near=recording.near or near, far=recording.far or far)
-    notes = [f"{SETTINGS} has no fps: each image is a camera of one instant"] if fps is None else []
+    notes = [f"{SETTINGS} has no fps: each image is its own camera at a single step"] if fps is None else []
     others = sum(path.is_dir() for path in model.parent.iterdir()) - 1 if model.name == "0" else 0
     if others > 0:
-        notes.append(f"{model} is read, {others} other models beside it are not")
+        notes.append(f"{model} is used; {others} other models are ignored")
     return dataclasses.replace(recording, layout=NAME, notes=tuple(notes))
 
 
@@ -109,7 +109,7 @@ def _viewmat(quaternion: tuple, translation: tuple, what: str) -> np.ndarray:
 
 
 def _depths(model: Path, recording: Recording) -> tuple[float, float] | None:
-    """near and far around the points that the cameras see; None where they see too few."""
+    """Estimates near and far from the depths of visible 3D points; None if too few are visible."""
     file = _file(model, "points3D")
     points = np.frombuffer(_points(file) if file else b"", dtype=np.float64).reshape(-1, 3)
     points = points[(np.abs(points) <= MAX_NUMBER).all(1)]
@@ -127,7 +127,7 @@ def _depths(model: Path, recording: Recording) -> tuple[float, float] | None:
 
 
 def _cameras(file: Path) -> Iterator[tuple[int, dict]]:
-    """(number, keys as in transforms.json) of every camera."""
+    """Yields (camera id, keys as in transforms.json)."""
     if file.suffix == ".bin":
         data = _Binary(file)
         for _ in range(data.count()):
@@ -148,7 +148,7 @@ def _cameras(file: Path) -> Iterator[tuple[int, dict]]:
 def _keys(file: Path, number: int, model: str, keys: str, size: tuple[int, int], values) -> dict:
     what = f"{file}: camera {number}"
     if not keys:
-        raise InputError(f"{what}: the model {model[:80]} is not read; use colmap image_undistorter")
+        raise InputError(f"{what}: camera model {model[:80]} is not supported; run colmap image_undistorter")
     if len(values) != len(keys.split()):
         raise InputError(f"{what}: {model} has {len(keys.split())} parameters; got {len(values)}")
     found = dict(zip(keys.split(), values, strict=True))
@@ -158,7 +158,7 @@ def _keys(file: Path, number: int, model: str, keys: str, size: tuple[int, int],
 
 
 def _images(file: Path) -> Iterator[tuple[str, int, tuple, tuple]]:
-    """(name, number of its camera, quaternion w x y z, translation) of every image."""
+    """Yields (name, camera id, quaternion (w, x, y, z), translation) of every image."""
     if file.suffix == ".bin":
         data = _Binary(file)
         for _ in range(data.count()):
@@ -179,7 +179,7 @@ def _images(file: Path) -> Iterator[tuple[str, int, tuple, tuple]]:
 
 
 def _points(file: Path) -> numbers_of:
-    """The first MAX_POINTS positions, one number after the other."""
+    """Returns the first MAX_POINTS positions as a flat array x, y, z, x, ..."""
     points = numbers_of("d")
     if file.suffix == ".bin":
         data = _Binary(file)
@@ -203,7 +203,7 @@ def _unreadable(what: str, line: str) -> InputError:
 
 
 def _lines(file: Path, pairs: bool = False) -> Iterator[tuple[str, str]]:
-    """(line, its number for messages) without comments; ``pairs``: the line after each, of points, is left out."""
+    """Yields (line, location for messages) without comments; ``pairs`` skips the 2D points line after each line."""
     with open(file, "rb") as opened:
         number = 0
         while raw := _line(opened, file):
@@ -221,7 +221,7 @@ def _lines(file: Path, pairs: bool = False) -> Iterator[tuple[str, str]]:
             if pairs:
                 number += 1
                 if len(_line(opened, file).split()) % 3:
-                    raise InputError(f"{file}: line {number} must hold the points of the image before it, or be empty")
+                    raise InputError(f"{file}: line {number} must hold the previous image's 2D points, or be empty")
 
 
 def _line(opened: BinaryIO, file: Path) -> bytes:
@@ -232,7 +232,7 @@ def _line(opened: BinaryIO, file: Path) -> bytes:
 
 
 class _Binary:
-    """A binary file, read from its start."""
+    """Sequential reader of a little-endian binary file."""
 
     def __init__(self, file: Path):
         self._file, self._at = file, 0
@@ -272,4 +272,4 @@ class _Binary:
         return name
 
     def _short(self) -> InputError:
-        return InputError(f"{self._file} cannot be read: it ends too early; it is cut off or no model of COLMAP")
+        return InputError(f"{self._file} cannot be read: it ends too early; it is truncated or not a COLMAP model")

@@ -1,4 +1,4 @@
-"""Splits of scenes, windows of steps, and the packing of images into Frames."""
+"""Train/test splits, windows of steps, and packing of images into Frames."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from gsim3d.data.recording import BACKGROUND, MOVING
 from gsim3d.data.scene import Scene
 from gsim3d.errors import InputError
 
-FEW_SCENES = 15  # below so many, one scene is held out
+FEW_SCENES = 15  # smaller data sets hold out one scene
 
 
 def split_scenes(scenes: Sequence, test_fraction: float = 0.12) -> tuple[list, list]:
-    """(train, test): every k-th scene of the list is held out, int(test_fraction * n) of them.
+    """Splits scenes into disjoint (train, test) lists by holding out every k-th scene.
 
-    Of fewer than 15 scenes one is held out; of a single scene none. No scene is in both lists.
+    ``int(test_fraction * n)`` scenes are held out; one if there are fewer than 15, none if there is only one.
     """
     if not 0 <= test_fraction < 1:
         raise InputError(f"test_fraction must lie in [0, 1); got {test_fraction}")
     n = len(scenes)
-    # The small term keeps int(0.1 * 30) at 3 whatever the rounding of the product.
+    # The epsilon guards products such as 0.1 * 30 against rounding below the integer.
     n_test = min(1, n - 1) if n < FEW_SCENES else int(test_fraction * n + 1e-9)
     if n_test < 1 or test_fraction == 0:
         return list(scenes), []
@@ -35,10 +35,10 @@ def split_scenes(scenes: Sequence, test_fraction: float = 0.12) -> tuple[list, l
 
 
 def published_split(scenes: Sequence, test_fraction: float = 0.12) -> tuple[list, list]:
-    """(train, test) by the rule of the published evaluation, to compare with its numbers; not for other use.
+    """Splits scenes into (train, test) by the rule of the published evaluation; use only to reproduce its numbers.
 
-    Of fewer than 15 scenes one is tested, which is also trained on; more than 15 may give more test scenes than the
-    fraction (150 of 1200).
+    With fewer than 15 scenes, the one test scene is also a training scene. With more, the test set may be larger than
+    the fraction (150 of 1200 scenes at 0.12).
     """
     if not 0 < test_fraction < 1:
         raise InputError(f"test_fraction must lie between 0 and 1; got {test_fraction}")
@@ -50,31 +50,31 @@ def published_split(scenes: Sequence, test_fraction: float = 0.12) -> tuple[list
 
 
 def generator(seed: int, step: int, sample: int, purpose: str) -> np.random.Generator:
-    """A generator for one purpose of one sample of one step; it does not depend on what was drawn before."""
+    """Returns a random generator seeded by (seed, step, sample, purpose), independent of all other draws."""
     return np.random.default_rng([seed, step, sample, zlib.crc32(purpose.encode())])
 
 
 def make_frames(
     scenes: Sequence[Scene], cams_per_scene: Sequence, steps_per_scene: Sequence, *, masked: bool | None = None
 ) -> Frames:
-    """Images of some cameras at some steps of some scenes, packed cloud after cloud.
+    """Packs the images of the given cameras and steps into one batch of Frames.
 
-    Clouds are sorted by (scene, step): scenes in the order given (one may come twice), steps as given, which
-    must ascend; ``cloud_step`` counts them from 0.
+    Clouds are sorted by (scene, step). ``cloud_step`` counts the steps of each scene from 0.
 
     Args:
-        scenes: one or more, with images of one size.
-        cams_per_scene: for each scene its camera numbers, the same at every step, or one list a step.
-        steps_per_scene: for each scene its step numbers.
-        masked: also read the labels: masks = not background, dynamic = bodies that may move. Otherwise masks leave
-            out only what was not recorded (padding, borders of undistorted images). None: where all scenes have labels.
+        scenes: one or more scenes of equal image size; a scene may appear twice.
+        cams_per_scene: camera indices of each scene: one list for all steps, or one list per step.
+        steps_per_scene: ascending step indices of each scene.
+        masked: read the labels: ``masks`` is the foreground and ``dynamic`` the movable bodies. If False, ``masks``
+            excludes only pixels without a recorded value (padding, borders of undistorted images). Default: True if
+            all scenes have labels.
 
     Raises:
-        InputError: missing files, numbers out of range, and scenes whose image sizes differ.
+        InputError: a file is missing, an index is out of range, or image sizes differ.
     """
     if not (len(scenes) == len(cams_per_scene) == len(steps_per_scene)) or not len(scenes):
         raise InputError(
-            "make_frames needs one list of cameras and one of steps for each of one or more scenes; "
+            "make_frames needs one or more scenes, with one list of cameras and one of steps for each; "
             f"got {len(scenes)} scenes, {len(cams_per_scene)} and {len(steps_per_scene)} lists"
         )
     masked = all(scene.has_segmentation() for scene in scenes) if masked is None else masked
@@ -112,7 +112,7 @@ def make_frames(
 
 
 def _join_valid(valid: list[Tensor | None], images: list[Tensor]) -> Tensor | None:
-    """bool [I, H, W], pixels that were recorded; None where all were."""
+    """Concatenates validity masks to bool [I, H, W]; returns None if all pixels are valid."""
     if all(one is None for one in valid):
         return None
     full = torch.ones(images[0][:, 0].shape[1:], dtype=torch.bool)
@@ -124,7 +124,7 @@ def _check_size(scene: Scene, first: Scene) -> None:
     if (scene.width, scene.height) != (first.width, first.height):
         raise InputError(
             f"{scene.path} has images of {scene.width}x{scene.height} pixels, {first.path} of "
-            f"{first.width}x{first.height}; one call takes one size"
+            f"{first.width}x{first.height}; all scenes of a batch must have one size"
         )
 
 
@@ -151,14 +151,14 @@ def _join_cameras(cameras: list[Cameras], image_cloud: list[int]) -> Cameras:
 
 @dataclass(frozen=True)
 class Window:
-    """Consecutive steps of one scene: the first ``n_context`` are given, the rest is to be predicted.
+    """Consecutive steps of one scene: ``n_context`` input steps, followed by steps to predict.
 
     Attributes:
-        scene: of the steps.
-        start: number of the first step.
-        n_context: given steps.
-        context_cams: camera numbers for each given step.
-        target_cams: camera numbers for each step.
+        scene: the scene.
+        start: index of the first step.
+        n_context: number of input steps.
+        context_cams: camera indices of each input step.
+        target_cams: camera indices of each step, input steps included.
     """
 
     scene: Scene
@@ -169,5 +169,5 @@ class Window:
 
     @property
     def steps(self) -> list[int]:
-        """Their numbers in the scene."""
+        """Indices of all steps in the scene."""
         return list(range(self.start, self.start + len(self.target_cams)))

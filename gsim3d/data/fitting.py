@@ -1,4 +1,4 @@
-"""Recordings as a model expects them: of another size, rate and depth range, in other units."""
+"""Conversion of recordings to a model's image size, frame rate, depth range and unit of length."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from gsim3d.data.cameras import depth_range, spread_steps
 from gsim3d.data.recording import BACKGROUND, FIXED, MOVING, ReadImages, Recording
 from gsim3d.errors import InputError
 
-MIN_EXTENT = 1e-3  # metres; cameras nearer to the origin than this have no length to divide by
-RATE_TOLERANCE = 1.0001e-3  # relative difference of frame rates that are the same: 29.97 and 30 are
+MIN_EXTENT = 1e-3  # metres; scenes with smaller camera coordinates are not normalised
+RATE_TOLERANCE = 1.0001e-3  # relative; 29.97 and 30 fps count as equal
 
 
 def frame_stride(rate: float, wanted: float) -> int | None:
-    """k where ``rate`` is k times ``wanted`` frames per second; None where it is no whole multiple."""
+    """Returns the integer ``rate / wanted``; None if ``rate`` is not an integer multiple of ``wanted``."""
     stride = max(1, round(rate / wanted))
     return stride if math.isclose(rate, stride * wanted, rel_tol=RATE_TOLERANCE) else None
 
 
 def resample(recording: Recording, fps: float) -> Recording:
-    """Every k-th frame of ``recording``, which has k times ``fps`` frames per second.
+    """Subsamples ``recording`` in time to ``fps`` frames per second.
 
     Raises:
-        InputError: its rate is no whole multiple of ``fps``.
+        InputError: the recording's rate is not an integer multiple of ``fps``.
     """
     if recording.n_steps == 1:
         return recording
     stride = frame_stride(recording.fps, fps)
     if stride is None:
         raise InputError(
-            f"{recording.source}: {recording.fps:g} frames per second are no whole multiple of the {fps:g} wanted"
+            f"{recording.source}: its {recording.fps:g} fps are not an integer multiple of the requested {fps:g} fps"
         )
     if stride == 1:
         return recording
 
-    def kept(read: ReadImages) -> ReadImages:
+    def strided(read: ReadImages) -> ReadImages:
         return lambda cam, steps, problems: read(cam, [stride * step for step in steps], problems)
 
     viewmats, Ks = (values[::stride] if len(values) > 1 else values for values in (recording.viewmats, recording.Ks))
@@ -51,22 +51,22 @@ def resample(recording: Recording, fps: float) -> Recording:
         fps=recording.fps / stride,
         viewmats=viewmats,
         Ks=Ks,
-        read_images=kept(recording.read_images),
-        read_labels=None if recording.read_labels is None else kept(recording.read_labels),
+        read_images=strided(recording.read_images),
+        read_labels=None if recording.read_labels is None else strided(recording.read_labels),
     )
 
 
 @dataclass(frozen=True)
 class Fitting:
-    """Changes of every recording of a data set; the defaults change nothing.
+    """How recordings are converted for a model; the defaults change nothing.
 
     Attributes:
-        size: (width, height) pixels: images are scaled until they cover it, smoothly, and cropped around their centre.
-        near_far: metres, the depth range of all scenes (in the new unit).
-        unit_cameras: lengths are divided by the largest coordinate of a scene's cameras at its first step.
-        slack: a scene whose own near or far is not that of ``near_far`` up to this factor keeps its own range.
-        enlarge: images smaller than ``size`` are scaled up; else they are refused.
-        whole: images are scaled until ``size`` holds them, and not cropped; padding fills the rest.
+        size: (width, height) in pixels. Images are resized to cover it (bilinear, antialiased) and centre-cropped.
+        near_far: depth range of all scenes in metres, after ``unit_cameras``.
+        unit_cameras: divide lengths by the largest camera coordinate of the scene's first step.
+        slack: scenes whose own near or far differs from ``near_far`` by more than this factor keep their own.
+        enlarge: upsample images smaller than ``size``; otherwise they are an error.
+        whole: resize images to fit into ``size`` and pad them, instead of cropping.
     """
 
     size: tuple[int, int] | None = None
@@ -78,7 +78,11 @@ class Fitting:
 
 
 def fit(recording: Recording, fitting: Fitting) -> Recording:
-    """``recording``, fitted. Raises InputError where images are smaller than ``fitting.size``."""
+    """Returns ``recording`` converted as ``fitting`` specifies.
+
+    Raises:
+        InputError: images are smaller than ``fitting.size`` and ``fitting.enlarge`` is off.
+    """
     if fitting.unit_cameras:
         recording = _in_units_of_cameras(recording)
     if fitting.size is not None and any(size != fitting.size for size in recording.sizes):
@@ -92,7 +96,7 @@ def fit(recording: Recording, fitting: Fitting) -> Recording:
 
 
 def own_depths(recording: Recording) -> tuple[float, float] | None:
-    """near and far: given, or around the point that the cameras look at; None: there is no such point."""
+    """Returns the recording's near and far, estimated from the cameras where absent; None if they have no focus."""
     near, far = recording.near, recording.far
     if near is None or far is None:
         guessed = depth_range(spread_steps(recording.viewmats).reshape(-1, 4, 4))
@@ -162,13 +166,13 @@ def _smooth(maps: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
 
 
 def _scale_colors(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """uint8 [h, w, 3] -> [h', w', 3]: bilinear, wide enough not to skip pixels."""
+    """Resizes uint8 [h, w, 3], bilinear with antialiasing."""
     scaled = _smooth(torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1).float(), size)
     return scaled.round().clamp(0, 255).to(torch.uint8).permute(1, 2, 0).numpy()
 
 
 def _scale_labels(labels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """uint8 [h, w] -> [h', w']: a pixel moves where any part of it does, and is background where all of it is."""
+    """Resizes labels uint8 [h, w]: MOVING if any source pixel is, BACKGROUND only if all source pixels are."""
     parts = torch.from_numpy(np.stack([labels != BACKGROUND, labels == MOVING])).float()
     shown, moving = _smooth(parts, size) > 0
     return torch.where(moving, MOVING, torch.where(shown, FIXED, BACKGROUND)).to(torch.uint8).numpy()

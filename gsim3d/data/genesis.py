@@ -1,7 +1,6 @@
-"""The published layout: metadata.json, and one PNG for each camera, step and image type (rgb, seg).
+"""Reader of the published layout: metadata.json, and one PNG per camera, step and image type (rgb, seg).
 
-Cameras are world-to-camera with OpenCV axes, with one matrix a step where they move. All keys:
-docs/reference/data.md.
+Cameras are world-to-camera with OpenCV axes; moving cameras have one matrix per step. All keys: docs/reference/data.md.
 """
 
 from __future__ import annotations
@@ -21,18 +20,18 @@ from gsim3d.errors import InputError
 
 NAME = "genesis"
 FILE = "metadata.json"
-DEFAULT_FPS = 42.0  # of the published sets, whose metadata has none
-DEFAULT_NEAR, DEFAULT_FAR = 1.0, 8.0  # metres, of the published sets, too
+DEFAULT_FPS = 42.0  # of the published data sets, whose metadata has no fps
+DEFAULT_NEAR, DEFAULT_FAR = 1.0, 8.0  # metres, of the published data sets
 TEMPLATE_FIELDS = {"cam_ix", "n_step", "img_type"}
 
 
 def recognises(folder: Path) -> bool:
-    """Whether ``folder`` has a metadata.json."""
+    """Returns whether ``folder`` has a metadata.json."""
     return (folder / FILE).is_file()
 
 
 def read(folder: Path, problems: Problems) -> Recording:
-    """The scene in ``folder``. Raises InputError where its description cannot be read at all."""
+    """Reads the scene in ``folder``. Raises InputError if its description cannot be parsed."""
     source = folder / FILE
     metadata = Description(recording.read_json(source), f"{source}: ", problems)
     n_steps = metadata.whole("n_steps", recording.MAX_STEPS)
@@ -68,7 +67,7 @@ def read(folder: Path, problems: Problems) -> Recording:
 def _camera(metadata: Description, name: str, n_steps: int) -> Camera:
     values, problems = metadata.values.get(name), metadata.problems
     if not isinstance(values, dict):
-        problems.add(f"{metadata.where}{name} is missing, though n_cams says that it exists")
+        problems.add(f"{metadata.where}{name} is missing, but n_cams includes it")
         return Camera(name, (1, 1), np.eye(4), np.eye(3))
     entry = Description(values, f"{metadata.where}{name}.", problems)
     size = entry.size("resolution")
@@ -84,18 +83,18 @@ def _camera(metadata: Description, name: str, n_steps: int) -> Camera:
 def _template(metadata: Description) -> str:
     template, where = metadata.values.get("file_path_template"), f"{metadata.where}file_path_template"
     if not isinstance(template, str):
-        raise InputError(f"{where} must be text; got {template!r}")
+        raise InputError(f"{where} must be a string; got {template!r}")
     try:
         parts = [part for part in string.Formatter().parse(template) if part[1] is not None]
     except ValueError as error:
-        raise InputError(f"{where} {template!r} is no format string: {error}") from error
+        raise InputError(f"{where} {template!r} is not a format string: {error}") from error
     fields = {field for _, field, _, _ in parts}
     if fields != TEMPLATE_FIELDS:
         raise InputError(
-            f"{where} must use the fields {', '.join(sorted(TEMPLATE_FIELDS))}, each as it is; "
+            f"{where} must use exactly the fields {', '.join(sorted(TEMPLATE_FIELDS))}; "
             f"got {', '.join(sorted(fields)) or 'none'}"
         )
-    # Only plain fields and zero-padded numbers: a format width of 10^9 would fill the memory.
+    # Only plain fields and zero-padded integers: a format width of 10^9 would exhaust memory.
     for _, field, spec, conversion in parts:
         if conversion or not re.fullmatch(r"" if field == "img_type" else r"(0?\d{1,2})?d?", spec):
             raise InputError(f"{where} may format numbers like n_step:04d only; got {template!r}")

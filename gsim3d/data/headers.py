@@ -1,4 +1,4 @@
-"""Headers of image files: PNG, JPEG, WebP and TIFF. They are read before memory is taken for pixels."""
+"""Parsers of PNG, JPEG, WebP and TIFF headers, so that size and integrity are checked before decoding."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ from dataclasses import dataclass
 
 PNG_START, JPEG_START = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 TIFF_STARTS = {b"II*\0": "<", b"MM\0*": ">"}
-TIFF_TYPES = {1: "B", 3: "H", 4: "I"}  # bytes, shorts and longs are all that the tags below hold
+TIFF_TYPES = {1: "B", 3: "H", 4: "I"}  # struct formats of the types that the tags below use: byte, short, long
 WIDTH, HEIGHT, PHOTOMETRIC, STRIPS, SAMPLES, STRIP_BYTES, TILES, TILE_BYTES = 256, 257, 262, 273, 277, 279, 324, 325
 ORIENTATION, EXTRA_SAMPLES = 274, 338
-READ_PHOTOMETRIC = (1, 2, 3, 6)  # grey, RGB, palette, YCbCr; not: white is zero, CMYK
+READ_PHOTOMETRIC = (1, 2, 3, 6)  # supported: grey, RGB, palette, YCbCr; unsupported: white-is-zero, CMYK
 MAX_TAGS, MAX_VALUES = 1000, 1 << 20
 
 
 @dataclass(frozen=True)
 class Header:
-    """The header of an image file.
+    """Header of an image file.
 
     Attributes:
-        size: (width, height).
-        whole: the file has its end.
-        alpha: it has transparency.
-        refused: why it is not read; "" where it is.
+        size: (width, height) in pixels.
+        whole: whether the file is complete (not truncated).
+        alpha: whether the image has an alpha channel or transparent colour.
+        refused: why the image is not supported; "" if it is.
     """
 
     size: tuple[int, int]
@@ -32,7 +32,7 @@ class Header:
 
 
 def read_header(data: bytes) -> Header | None:
-    """The header of an image file's bytes; None where they are no PNG, JPEG, WebP or TIFF."""
+    """Parses the header of an encoded image; returns None if it is not PNG, JPEG, WebP or TIFF."""
     try:
         if data.startswith(PNG_START):
             return _png(data)
@@ -41,14 +41,14 @@ def read_header(data: bytes) -> Header | None:
         if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
             return _webp(data)
         return _tiff(data, TIFF_STARTS[data[:4]]) if data[:4] in TIFF_STARTS else None
-    except (struct.error, IndexError):  # cut off inside of the header
+    except (struct.error, IndexError):  # truncated within the header
         return None
 
 
 def _png(data: bytes) -> Header | None:
     if len(data) < 33 or data[12:16] != b"IHDR":
         return None
-    # Chunk by chunk: decoders take memory for as many bytes as a chunk claims to have, up to 2 GiB.
+    # Checks every chunk length: decoders allocate the length a chunk declares, up to 2 GiB.
     at, alpha, whole = 8, data[25] in (4, 6), False
     while at + 12 <= len(data) and not whole:
         kind = data[at + 4 : at + 8]
@@ -106,7 +106,7 @@ def _tiff(data: bytes, order: str) -> Header | None:
     ends = [start + length for start, length in parts]
     refused = "" if tags.get(PHOTOMETRIC, (1,))[0] in READ_PHOTOMETRIC else "is inverted or CMYK"
     if tags.get(ORIENTATION, (1,))[0] != 1:
-        refused = "is turned by its orientation tag"
+        refused = "is rotated by its orientation tag"
     if _long(data, order, first + 2 + 12 * n_tags):
         refused = "has several pages"
     alpha = EXTRA_SAMPLES in tags or tags.get(SAMPLES, (1,))[0] in (2, 4)

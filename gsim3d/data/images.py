@@ -1,4 +1,4 @@
-"""Image files, checked before they are decoded, and decoded images, each read once: in memory or memory-mapped."""
+"""Validated reading of image files, conversion to colours, labels and masks, and a cache of decoded images."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from gsim3d.errors import InputError
 
 LOSSY_SUFFIXES = (".jpg", ".jpeg", ".webp")
 IMAGE_SUFFIXES = (".png", ".tif", ".tiff", *LOSSY_SUFFIXES)
-MAX_FILE = 1 << 29  # bytes of one image file
-HEADER = 1 << 16  # bytes that most headers lie in
-MAX_ID = 16  # masks whose values are all below it hold ids of bodies
-MAX_SOFT = 0.2  # of the pixels of a mask may be nearer to half of its range than to its ends
-MAX_LABELS = 256  # masks of more values hold none
+MAX_FILE = 1 << 29  # bytes
+HEADER = 1 << 16  # bytes; enough for most image headers
+MAX_ID = 16  # masks with only smaller values are taken to hold body ids
+MAX_SOFT = 0.2  # largest fraction of mask pixels with values near half of the range
+MAX_LABELS = 256  # masks with more distinct values are not label images
 
 
 def read_image(file: Path, size: tuple[int, int], frame: str, problems: Problems) -> np.ndarray | None:
-    """The pixels of a PNG, JPEG, WebP or TIFF file as it stores them, [h, w] or [h, w, 3 or 4] (blue first).
+    """Decodes a PNG, JPEG, WebP or TIFF file after validating its header.
 
     Args:
         file: path.
-        size: (width, height) that it must have; the header is read before pixels are decoded.
+        size: expected (width, height).
         frame: camera and frame, for messages.
-        problems: what is wrong is added to them.
+        problems: receives the errors found.
 
     Returns:
-        uint8 or uint16; None where there is a problem.
+        uint8 or uint16, [h, w] or [h, w, 3 or 4] (BGR or BGRA); None on error.
     """
     import cv2
 
@@ -49,17 +49,17 @@ def read_image(file: Path, size: tuple[int, int], frame: str, problems: Problems
     elif header.size != size:
         problems.add(f"{what} has {header.size[0]}x{header.size[1]} pixels, its camera {size[0]}x{size[1]}")
     elif not header.whole:
-        problems.add(f"{what} cannot be decoded: its end is missing")
+        problems.add(f"{what} cannot be decoded: it is truncated")
     elif header.refused:
-        problems.add(f"{what} {header.refused}; save it as one plain image")
+        problems.add(f"{what} {header.refused}; save it as a single plain image")
     else:
         image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
         if image is None or image.shape[1::-1] != size:
             problems.add(f"{what} cannot be decoded")
         elif image.dtype not in (np.uint8, np.uint16):
-            problems.add(f"{what} must have 8 or 16 bits a channel; got {image.dtype}")
+            problems.add(f"{what} must have 8 or 16 bits per channel; got {image.dtype}")
         elif header.alpha and not _has_alpha(image):
-            problems.add(f"{what} has a transparency that cannot be read; save it as RGBA")
+            problems.add(f"{what} has a kind of transparency that is not supported; save it as RGBA")
         else:
             return image
     return None
@@ -80,11 +80,11 @@ def _bytes_of(file: Path, what: str, problems: Problems, most: int = -1) -> byte
 
 
 def header_of(file: Path, frame: str, problems: Problems) -> Header | None:
-    """Size and kind of an image file, without its pixels; None where there is a problem."""
+    """Reads only the header of an image file; returns None on error."""
     what = f"image {file} ({frame})"
     data = _bytes_of(file, what, problems, HEADER)
     header = None if data is None else read_header(data)
-    if header is None and data is not None and len(data) == HEADER:  # it lies farther behind
+    if header is None and data is not None and len(data) == HEADER:  # longer than usual
         data = _bytes_of(file, what, problems)
         header = None if data is None else read_header(data)
     if data is not None and header is None:
@@ -93,7 +93,7 @@ def header_of(file: Path, frame: str, problems: Problems) -> Header | None:
 
 
 def as_color(image: np.ndarray, file: Path, frame: str, problems: Problems) -> np.ndarray:
-    """uint8 [h, w, 3], RGB: grey is repeated, 16 bits are rounded to 8, transparency is composed on black."""
+    """Converts to uint8 RGB [h, w, 3]: grey is replicated, 16 bits are rounded to 8, alpha is composited on black."""
     image = _over_black(image)
     if image.dtype == np.uint16:
         image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)
@@ -101,9 +101,9 @@ def as_color(image: np.ndarray, file: Path, frame: str, problems: Problems) -> n
 
 
 def as_labels(image: np.ndarray, file: Path, frame: str, problems: Problems) -> np.ndarray | None:
-    """uint8 [h, w], the one channel of a label image."""
+    """Converts a label image to uint8 [h, w]."""
     if image.ndim == 3 and (image[..., :1] != image[..., :3]).any():
-        problems.add(f"image {file} ({frame}) must hold labels in one channel; got a colour image")
+        problems.add(f"image {file} ({frame}) must be a single-channel label image; got a colour image")
         return None
     labels = image if image.ndim == 2 else image[..., 0]
     if file.suffix.lower() in LOSSY_SUFFIXES or labels.max() > 255:
@@ -113,10 +113,10 @@ def as_labels(image: np.ndarray, file: Path, frame: str, problems: Problems) -> 
 
 
 def as_mask(image: np.ndarray, file: Path | None, frame: str, problems: Problems) -> np.ndarray | None:
-    """uint8 [h, w]: MOVING where a mask is set, else BACKGROUND.
+    """Converts a mask to labels uint8 [h, w]: MOVING where it is set, else BACKGROUND.
 
-    A mask of two values, up to compression noise and soft borders, is set above half of its range; one of labels is set
-    where it is not 0. Colours count by their largest channel.
+    Binary masks, including those with compression noise or soft borders, are thresholded at half of their range; label
+    images are set where they are not 0. Colour images are reduced to the maximum over channels.
     """
     grey = _over_black(image)
     grey = np.ascontiguousarray(grey if grey.ndim == 2 else grey.max(-1))
@@ -124,27 +124,27 @@ def as_mask(image: np.ndarray, file: Path | None, frame: str, problems: Problems
     marked = _marked(grey, lossy)
     if marked is None:
         problems.add(
-            f"image {file} ({frame}) is no mask: its values are neither two, up to noise and soft borders, nor labels; "
-            "save it as 0 and 255"
+            f"image {file} ({frame}) is not a mask: it is neither binary (up to noise and soft borders) nor a label "
+            "image; save it with the values 0 and 255"
         )
         return None
     return np.where(marked, MOVING, BACKGROUND).astype(np.uint8)
 
 
 def as_opaque(image: np.ndarray, file: Path, frame: str, problems: Problems) -> np.ndarray:
-    """uint8 [h, w]: MOVING where an image is more opaque than transparent, else BACKGROUND."""
+    """Converts alpha to labels uint8 [h, w]: MOVING where an image is opaque, else BACKGROUND."""
     return np.where(is_opaque(image), MOVING, BACKGROUND).astype(np.uint8)
 
 
 def is_opaque(image: np.ndarray) -> np.ndarray:
-    """bool [h, w]: where alpha is above half of its range, everywhere in images without."""
+    """Returns bool [h, w]: whether alpha is above half of its range; True everywhere without alpha."""
     if not _has_alpha(image):
         return np.ones(image.shape[:2], bool)
     return image[..., 3] > np.iinfo(image.dtype).max // 2
 
 
 def is_marked(image: np.ndarray) -> np.ndarray:
-    """bool [h, w]: where any channel but alpha is not zero."""
+    """Returns bool [h, w]: whether any channel except alpha is nonzero."""
     return image > 0 if image.ndim == 2 else (image[..., :3] > 0).any(-1)
 
 
@@ -153,7 +153,7 @@ def _has_alpha(image: np.ndarray) -> bool:
 
 
 def _over_black(image: np.ndarray) -> np.ndarray:
-    """Without alpha: colours composed on black, the background of every scene."""
+    """Removes alpha by compositing on black."""
     if not _has_alpha(image):
         return image
     alpha, full = image[..., 3:].astype(np.uint32), np.iinfo(image.dtype).max
@@ -161,13 +161,13 @@ def _over_black(image: np.ndarray) -> np.ndarray:
 
 
 def _marked(grey: np.ndarray, lossy: bool) -> np.ndarray | None:
-    """bool [h, w]: where a mask is set; None where it is neither of two values nor of labels."""
+    """Returns bool [h, w]: where a mask is set; None if it is neither binary nor a label image."""
     levels = np.flatnonzero(np.bincount(grey.ravel()))
     low, high = int(levels[0]), int(levels[-1])
     full = np.iinfo(grey.dtype).max
     if high == 0 or (high < MAX_ID and not lossy) or _are_labels(grey, levels):
         return grey > 0
-    if len(levels) == 1 or lossy:  # compression leaves the ends of the range where they are
+    if len(levels) == 1 or lossy:  # lossy compression keeps 0 and 255, but adds values between
         low, high = 0, full
     soft = (grey > low + (high - low) // 4) & (grey < high - (high - low) // 4)
     if soft.mean() > MAX_SOFT or _blocks(soft).any() or (lossy and not (grey > high - (high - low) // 4).any()):
@@ -176,7 +176,7 @@ def _marked(grey: np.ndarray, lossy: bool) -> np.ndarray | None:
 
 
 def _are_labels(grey: np.ndarray, levels: np.ndarray) -> bool:
-    """Whether most values between the first and the last one cover areas: noise and soft borders do not."""
+    """Returns whether most intermediate values form flat regions, unlike noise and soft borders."""
     import cv2
 
     inner = levels[1:-1]
@@ -188,22 +188,22 @@ def _are_labels(grey: np.ndarray, levels: np.ndarray) -> bool:
 
 
 def _blocks(where: np.ndarray) -> np.ndarray:
-    """bool [h, w]: pixels whose neighbours, up to 2 pixels away, belong to ``where`` like themselves."""
+    """Erodes bool [h, w] by a 5x5 block."""
     import cv2
 
-    block = np.ones((5, 5), np.uint8)  # borders of colours, which JPEG stores at half of the resolution, are narrower
+    block = np.ones((5, 5), np.uint8)  # wider than soft borders of JPEG chroma at half resolution
     return cv2.erode(where.astype(np.uint8), block, borderType=cv2.BORDER_REPLICATE) > 0
 
 
 class ImageCache:
-    """Images of one kind of one scene, uint8 [H, W, 3] or [H, W], decoded once.
+    """Cache of the decoded images or labels of one scene, uint8 [H, W, 3] or [H, W], in memory or in a .npy file.
 
     Args:
-        shape: [T, V, H, W, ...] of all of them; only images that were read take memory.
-        read: (cam, steps) -> the images of one camera, in the order of ``steps``.
-        cache_dir: folder of a .npy file with all of them decoded, of which single images are read; None: they stay in
-            memory. A file is open only while it is read, so a set may have any number of scenes.
-        key: differs for every scene, kind and state of its files.
+        shape: [T, V, H, W, ...]; in memory, only images that were read are stored.
+        read: function (cam, steps) -> the images of one camera, in the order of ``steps``.
+        cache_dir: folder for the .npy file, which holds all images; None caches in memory. The file is open only
+            during a read, so that a data set may have any number of scenes.
+        key: identifies the scene, the kind of image and the version of the source files.
     """
 
     def __init__(self, shape, read, cache_dir: str | Path | None, key: tuple):
@@ -212,12 +212,12 @@ class ImageCache:
         if cache_dir is not None:
             name = hashlib.sha256(repr((*key, self._shape)).encode()).hexdigest()[:32]
             self._file = Path(cache_dir) / f"{name}.npy"
-        self._start: int | None = None  # byte at which the pixels of the file begin, once the file was checked
+        self._start: int | None = None  # byte offset of the pixels in the file, known once the file was validated
         self._images: dict[tuple[int, int], np.ndarray] = {}
-        self._lock = threading.Lock()  # samples of a training step are read side by side
+        self._lock = threading.Lock()  # samples of a training step are read by concurrent threads
 
     def get(self, steps: Sequence[int], cams: Sequence[int]) -> np.ndarray:
-        """A copy of the images at ``steps`` x ``cams``."""
+        """Returns a copy of the images at ``steps`` x ``cams``, [len(steps), len(cams), ...]."""
         images = np.empty((len(steps), len(cams), *self._shape[2:]), np.uint8)
         if self._file is not None:
             self._fetch(steps, cams, images)
@@ -232,7 +232,7 @@ class ImageCache:
         return images
 
     def _fetch(self, steps: Sequence[int], cams: Sequence[int], images: np.ndarray) -> None:
-        """Reads from the file, which is made if it is missing; the kernel's page cache keeps what is read often."""
+        """Reads from the file, which is written first if missing; the page cache serves repeated reads."""
         with self._lock:
             if self._start is None:
                 if not self._file.is_file():
@@ -252,14 +252,14 @@ class ImageCache:
                     raise ValueError("another version of the format")
                 shape, by_column, dtype = np.lib.format.read_array_header_1_0(file)
             except ValueError as error:
-                raise InputError(f"{self._file} is no cache of this scene ({error}); remove it") from error
+                raise InputError(f"{self._file} is not a cache of this scene ({error}); remove it") from error
             whole = self._file.stat().st_size == file.tell() + int(np.prod(self._shape, dtype=object))
             if shape != self._shape or by_column or dtype != np.uint8 or not whole:
-                raise InputError(f"{self._file} is no cache of this scene; remove it")
+                raise InputError(f"{self._file} is not a cache of this scene; remove it")
             return file.tell()
 
     def _write(self) -> None:
-        """Decodes everything into the file, which appears whole or not at all."""
+        """Decodes all images into the file, which is moved into place once complete."""
         folder = self._file.parent
         folder.mkdir(parents=True, exist_ok=True)
         needed, free = int(np.prod(self._shape, dtype=object)), shutil.disk_usage(folder).free
@@ -276,16 +276,16 @@ class ImageCache:
 
 
 def read_files(files: Iterator[tuple[Path, str]], size, convert, problems: Problems) -> Iterator[np.ndarray | None]:
-    """Images of files, one after the other.
+    """Reads and converts image files.
 
     Args:
-        files: path, and camera and frame for messages.
-        size: (width, height) that they must have.
+        files: pairs of path and "camera, frame" for messages.
+        size: expected (width, height).
         convert: :func:`as_color`, :func:`as_labels`, :func:`as_mask` or :func:`as_opaque`.
-        problems: what is wrong is added to them.
+        problems: receives the errors found.
 
     Yields:
-        Converted images; None where there is a problem.
+        Converted images; None on error.
     """
     for file, frame in files:
         image = read_image(file, size, frame, problems)

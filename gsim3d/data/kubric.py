@@ -1,7 +1,7 @@
-"""Kubric's output and the MOVi layout made of it: one folder for each camera, each with its own metadata.json.
+"""Reader of Kubric output and the MOVi layout: one folder per camera, each with its own metadata.json.
 
-Cameras have Blender's axes (x right, y up, z backwards); the number in a file name is the number of the pose. What the
-segmentation marks may move; the rest is fixed, and background where alpha is 0. All keys: docs/reference/data.md.
+Cameras have Blender's axes (x right, y up, z backwards); the number in a file name indexes the poses. Segmented pixels
+are movable bodies, other opaque pixels are fixed, transparent ones are background. All keys: docs/reference/data.md.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from gsim3d.errors import InputError
 
 NAME = "kubric"
 FILE = "metadata.json"
-DEFAULT_FPS = 12.0  # of the MOVi sets
-DEFAULT_NEAR, DEFAULT_FAR = 1.0, 20.0  # metres, as the published loader has them for MOVi
+DEFAULT_FPS = 12.0  # of the MOVi data sets
+DEFAULT_NEAR, DEFAULT_FAR = 1.0, 20.0  # metres, of the published MOVi loader
 CAMERA_FOLDER = re.compile(r"(cam|camera|view)[_-]?\d+")
 QUATERNION_TOLERANCE = 1e-2
 
 
 def recognises(folder: Path) -> bool:
-    """Whether ``folder`` has camera folders with metadata.json, or a metadata.json that describes one camera."""
+    """Returns whether ``folder`` is a camera folder with metadata.json, or contains such folders."""
     return bool(_camera_folders(folder))
 
 
 def read(folder: Path, problems: Problems) -> Recording:
-    """The scene in ``folder``. Raises InputError where its description cannot be read at all."""
+    """Reads the scene in ``folder``. Raises InputError if its description cannot be parsed."""
     files = [_CameraFiles(folder, path, problems) for path in _camera_folders(folder)]
     first = files[0]
     source = folder if len(files) > 1 else first.source
@@ -81,7 +81,7 @@ def _describes_camera(file: Path) -> bool:
 
 
 class _CameraFiles:
-    """One camera's folder. images, segmentation: frame number -> file."""
+    """Folder of one camera. ``images`` and ``segmentation`` map frame numbers to files."""
 
     def __init__(self, scene: Path, folder: Path, problems: Problems):
         self.name = folder.name
@@ -99,11 +99,11 @@ class _CameraFiles:
         self.segmentation = self._files(scene, folder, "segmentation")
 
     def frame(self, number: int) -> str:
-        """Camera and frame, for messages."""
+        """Returns "camera, frame" for messages."""
         return f"camera {self.name}, frame {number}"
 
     def labels(self, number: int, has_segmentation: bool, problems: Problems) -> np.ndarray | None:
-        """uint8 [h, w] of frame ``number``; without any segmentation all that is no background may move."""
+        """Reads labels uint8 [h, w] of a frame; without segmentation the whole foreground is MOVING."""
         image = read_image(self.images[number], self.size, self.frame(number), problems)
         if image is None:
             return None

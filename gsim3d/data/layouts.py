@@ -1,7 +1,7 @@
-"""The layouts of scene folders that can be read, and the search for such folders.
+"""Registry of scene-folder layouts, and the search for scene folders.
 
-A layout is a module with NAME, FILE (which describes a scene), ``recognises(folder)`` and
-``read(folder, problems) -> Recording``. To read another kind of folder, write such a module and list it here.
+A layout is a module with NAME, FILE (the name of the description file), ``recognises(folder)`` and
+``read(folder, problems) -> Recording``. To support another layout, write such a module and list it here.
 """
 
 from __future__ import annotations
@@ -13,12 +13,16 @@ from gsim3d.data import colmap, genesis, kubric, transforms, videos
 from gsim3d.data.recording import natural_order
 from gsim3d.errors import InputError
 
-LAYOUTS = (kubric, genesis, transforms, videos, colmap)  # the first that recognises a folder reads it
-MAX_DEPTH = 3  # folders below the one that is searched
+LAYOUTS = (kubric, genesis, transforms, videos, colmap)  # in order of precedence
+MAX_DEPTH = 3  # levels of subfolders that are searched
 
 
 def layout_of(folder: str | Path) -> ModuleType:
-    """The layout of a scene folder. Raises InputError where it has none."""
+    """Returns the layout module of a scene folder.
+
+    Raises:
+        InputError: no layout recognises the folder.
+    """
     found = _find(Path(folder))
     if found is None:
         raise InputError(f"{folder} is not a scene folder: it has no {_files()} (see docs/reference/data.md)")
@@ -26,12 +30,12 @@ def layout_of(folder: str | Path) -> ModuleType:
 
 
 def find_scenes(root: str | Path) -> list[Path]:
-    """Scene folders at or below ``root`` (at most three levels down), in natural order of their paths.
+    """Finds the scene folders at or up to three levels below ``root``, in natural order of their paths.
 
-    Hidden folders are skipped: a scene that is being written lies in one. Scenes hold no other scenes.
+    Hidden folders are skipped, because unfinished scenes are written to them; scene folders are not searched further.
 
     Raises:
-        InputError: there is none.
+        InputError: ``root`` is not a folder or contains no scene.
     """
     root = Path(root)
     if not root.is_dir():
@@ -46,7 +50,7 @@ def find_scenes(root: str | Path) -> list[Path]:
                 below += [child for child in folder.iterdir() if child.is_dir() and not child.name.startswith(".")]
         folders = below
     if not found:
-        raise InputError(f"{root} holds no scene: no {_files()} in it or up to three folders below")
+        raise InputError(f"{root} contains no scene: no {_files()} in it or up to three levels below")
     return sorted(found, key=lambda path: natural_order(path.relative_to(root).as_posix()))
 
 

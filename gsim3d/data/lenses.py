@@ -1,4 +1,4 @@
-"""Lens models by their published names, and images undistorted to a pinhole."""
+"""Lens distortion models by their published names, and undistortion of images to a pinhole camera."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FISHEYE = {
     "RADIAL_FISHEYE": ("k1", "k2"),
     "SIMPLE_RADIAL_FISHEYE": ("k1",),
 }
-# Keys of lenses that no image is undistorted from, and names that others have for coefficients.
+# Keys of unsupported lens models, and other names of coefficients; nonzero values are an error.
 OTHER_KEYS = (
     *(f"ftheta_p{i}" for i in range(5)), "latlong", "equirectangular", "rolling_shutter",
     "s1", "s2", "s3", "s4", "sx1", "sy1", "tau_x", "tau_y", "b1", "b2", "p3", "p4", "omega", "xi", "skew",
@@ -37,22 +37,22 @@ UNREAD = re.compile(
     r"(dist|distortion)(_?(coeffs?|coefficients))?|D|lens(_?(coeffs?|params))?|(radial|tangential)_distortion",
     re.IGNORECASE,
 )
-SAMPLES = 2000  # of the radius, which must grow with the angle
-WIDEST = 1.55  # radians from the axis: a pinhole sees less than 90 degrees of it
+SAMPLES = 2000  # angles at which the distorted radius is sampled
+WIDEST = 1.55  # radians from the optical axis; a pinhole image covers less than 90 degrees
 
 
 def lens_of(values: Mapping, what: str, problems: Problems) -> Lens | None:
-    """The lens of a description; None: a pinhole.
+    """Parses the lens of a camera description; returns None for a pinhole.
 
     Args:
         values: keys of the description.
-        what: for messages.
-        problems: keys of lenses that are not read are added to them.
+        what: name of the camera, for messages.
+        problems: receives unsupported and inconsistent keys.
     """
     for key, value in values.items():
         if (key in OTHER_KEYS or UNREAD.fullmatch(str(key))) and _is_set(value):
             known = ", ".join(COEFFICIENTS)
-            problems.add(f"{what}: the lens key {key:.80} is not read; use {known}, or undistort the images")
+            problems.add(f"{what}: the lens key {key:.80} is not supported; use {known}, or undistort the images")
             return None
     model, flag = values.get("camera_model"), values.get("is_fisheye", False)
     if not isinstance(flag, bool):
@@ -62,12 +62,12 @@ def lens_of(values: Mapping, what: str, problems: Problems) -> Lens | None:
     known = PERSPECTIVE | FISHEYE
     if not isinstance(model, str) or model not in known:
         problems.add(
-            f"{what}: camera_model {model!r:.80} is not read; undistort the images to a pinhole (known: "
+            f"{what}: camera_model {model!r:.80} is not supported; undistort the images to a pinhole (supported: "
             f"{', '.join(known)})"
         )
         return None
     if flag and model not in FISHEYE:
-        problems.add(f"{what}: camera_model is {model}, but is_fisheye is true; remove the wrong one")
+        problems.add(f"{what}: camera_model is {model}, but is_fisheye is true; remove one of them")
         return None
     numbers = _coefficients(values, what, problems)
     extra = next((key for key in COEFFICIENTS if numbers[key] and key not in known[model]), None)
@@ -83,7 +83,7 @@ def lens_of(values: Mapping, what: str, problems: Problems) -> Lens | None:
 
 
 def _is_set(value) -> bool:
-    """Whether a value is a number other than 0, or a list or object that holds one."""
+    """Returns whether a value is a nonzero number, or a list or object with a nonzero item."""
     if isinstance(value, (list, dict)):
         return any(item not in (0, None) for item in (value.values() if isinstance(value, dict) else value))
     return isinstance(value, (int, float)) and value != 0
@@ -100,10 +100,10 @@ def _coefficients(values: Mapping, what: str, problems: Problems) -> dict[str, f
 
 
 class Undistorter:
-    """Images of one camera, as a pinhole of the same intrinsics sees them.
+    """Undistorts images of one camera to a pinhole camera with the same intrinsics.
 
     Args:
-        lens: of the camera.
+        lens: distortion of the camera.
         size: (width, height) of its images.
     """
 
@@ -118,19 +118,19 @@ class Undistorter:
         return cv2.remap(image, x, y, cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR, borderValue=0)
 
     def valid(self, K: np.ndarray) -> np.ndarray:
-        """bool [h, w]: pixels that come from inside the distorted image."""
+        """Returns bool [h, w]: whether the source of a pixel lies inside the distorted image."""
         x, y = self._sources(K)
         return (x >= 0) & (x <= self._size[0] - 1) & (y >= 0) & (y <= self._size[1] - 1)
 
     def _sources(self, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """x and y of each pixel in the distorted image, float32 [h, w]; kept for the next image."""
+        """Returns the source coordinates x and y of each pixel, float32 [h, w]; cached for equal K."""
         import cv2
 
         if self._key is None or not np.array_equal(self._key, K):
             centred = K.copy()
-            centred[:2, 2] -= 0.5  # OpenCV's pixel centres are whole numbers
+            centred[:2, 2] -= 0.5  # OpenCV's pixel centres are integers
             make = cv2.fisheye.initUndistortRectifyMap if self._lens.fisheye else cv2.initUndistortRectifyMap
-            # As a camera of focal length 1, because OpenCV's lenses have no skew.
+            # Distorts with focal length 1 and applies K afterwards, because OpenCV's lenses have no skew.
             x, y = make(np.eye(3), self._lens.coefficients, np.eye(3), centred, self._size, cv2.CV_32FC1)
             folded = self._radius(K) > _reach(self._lens)
             sources = centred[0, 0] * x + centred[0, 1] * y + centred[0, 2], centred[1, 1] * y + centred[1, 2]
@@ -139,15 +139,17 @@ class Undistorter:
         return self._maps
 
     def _radius(self, K: np.ndarray) -> np.ndarray:
-        """[h, w]: the tangent of the angle between the ray of each pixel and the optical axis."""
+        """Returns [h, w], the tangent of the angle between each pixel's ray and the optical axis."""
         y = (np.arange(self._size[1]) + 0.5 - K[1, 2]) / K[1, 1]
         x = (np.arange(self._size[0]) + 0.5 - K[0, 2]) / K[0, 0]
         return np.hypot(x[None] - K[0, 1] / K[0, 0] * y[:, None], y[:, None])
 
 
 def _reach(lens: Lens) -> float:
-    """The tangent of the angle up to which the radius in the image grows. Beyond it the polynomial turns back, and
-    pixels would show other directions."""
+    """Returns the tangent of the largest angle up to which the distorted radius increases.
+
+    Beyond it the distortion polynomial is not invertible, and pixels would show wrong directions.
+    """
     angles = np.linspace(0, WIDEST, SAMPLES)
     if lens.fisheye:
         k1, k2, k3, k4 = lens.coefficients

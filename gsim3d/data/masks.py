@@ -1,4 +1,4 @@
-"""Labels of real videos: moving bodies cut out of a background that stands still."""
+"""Background subtraction: masks of moving bodies in videos of static cameras."""
 
 from __future__ import annotations
 
@@ -6,22 +6,25 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-MEDIAN_STEPS = 51  # evenly spread; more change the median little
-MIN_STEPS = 8  # fewer show no background
-NOISE_FACTOR = 6.0  # a pixel is foreground where it differs by so many times the camera's noise ...
-MIN_DIFFERENCE = 18.0  # ... and by at least so much of 255
-BLUR = 1.2  # pixels; noise of single pixels and blocks of JPEG are smoothed before they are compared
-CLOSE_SHARE = 0.012  # of the image's height: gaps so wide are closed
-MIN_AREA = 0.001  # of the image; smaller spots are noise ...
-MAX_HOLE = 0.005  # ... and smaller holes are body that looks like what is behind it
+MEDIAN_STEPS = 51  # evenly spaced steps from which the median is computed
+MIN_STEPS = 8  # fewest steps from which a background is estimated
+NOISE_FACTOR = 6.0  # foreground threshold, in multiples of the median difference ...
+MIN_DIFFERENCE = 18.0  # ... and its minimum, of 255
+BLUR = 1.2  # pixels, sigma of the Gaussian that suppresses noise and JPEG blocks
+CLOSE_SHARE = 0.012  # radius of the morphological closing, as a fraction of the image height
+MIN_AREA = 0.001  # fraction of the image; smaller components are removed
+MAX_HOLE = 0.005  # fraction of the image; smaller holes are filled
 
 
 def median_image(read: Callable[[Sequence[int]], np.ndarray], n_steps: int) -> np.ndarray:
-    """uint8 [h, w, 3], the background of a camera that stands still: its median over at most MEDIAN_STEPS steps.
+    """Estimates the background of a static camera as the median image over at most MEDIAN_STEPS steps.
 
     Args:
-        read: steps -> uint8 [S, h, w, 3].
-        n_steps: of the camera.
+        read: function steps -> uint8 [S, h, w, 3].
+        n_steps: number of steps recorded.
+
+    Returns:
+        uint8 [h, w, 3].
     """
     steps = np.unique(np.linspace(0, n_steps - 1, min(n_steps, MEDIAN_STEPS)).round().astype(int)).tolist()
     frames = read(steps)
@@ -30,12 +33,12 @@ def median_image(read: Callable[[Sequence[int]], np.ndarray], n_steps: int) -> n
 
 
 def foreground(image: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """bool [h, w], pixels that differ from ``background`` by more than noise; gaps closed, spots removed."""
+    """Returns bool [h, w]: pixels that differ from ``background`` by more than noise, cleaned by morphology."""
     import cv2
 
     smooth = [cv2.GaussianBlur(picture, (0, 0), BLUR).astype(np.float32) for picture in (image, background)]
     difference = np.abs(smooth[0] - smooth[1]).max(-1)
-    # Most of the image is background: the median of the differences is a robust measure of its noise.
+    # Most of the image is background, so the median difference is a robust estimate of the noise.
     mask = (difference > max(MIN_DIFFERENCE, NOISE_FACTOR * float(np.median(difference)))).astype(np.uint8)
     radius = max(1, round(CLOSE_SHARE * image.shape[0]))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
@@ -46,7 +49,7 @@ def foreground(image: np.ndarray, background: np.ndarray) -> np.ndarray:
 
 
 def _large(mask: np.ndarray, least: float) -> np.ndarray:
-    """bool [h, w], the connected parts of ``mask`` that cover at least ``least`` of the image."""
+    """Returns bool [h, w]: the connected components of ``mask`` with at least the fraction ``least`` of the image."""
     import cv2
 
     _, parts, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)

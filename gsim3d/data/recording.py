@@ -1,4 +1,4 @@
-"""The canonical form of a recorded scene, and what readers share: problems, checked values, files, frame numbers."""
+"""Recording, the canonical form of a recorded scene, and helpers shared by the layout readers."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ import numpy as np
 from gsim3d.errors import InputError
 from gsim3d.io.files import MAX_TEXT, read_file
 
-MAX_STEPS, MAX_CAMS, MAX_SIZE = 1_000_000, 10_000, 16_384  # beyond them a description is taken to be broken
-MAX_NUMBER = 1e9  # metres, pixels, seconds: the same
-MAX_NAME = 200  # letters of a file name
-HALF_PAIR = re.compile(r"\\u[dD][89a-fA-F]")  # what may be one in JSON
-SPACING_TOLERANCE = 0.01  # of the time between two steps
-BACKGROUND, FIXED, MOVING = 0, 1, 3  # labels of pixels: nothing, what never moves, bodies that may move
+MAX_STEPS, MAX_CAMS, MAX_SIZE = 1_000_000, 10_000, 16_384  # larger values are rejected as errors
+MAX_NUMBER = 1e9  # metres, pixels, seconds; larger values are rejected as errors
+MAX_NAME = 200  # characters of a file name
+HALF_PAIR = re.compile(r"\\u[dD][89a-fA-F]")  # JSON escape of a surrogate, possibly unpaired
+SPACING_TOLERANCE = 0.01  # relative, of the time between two steps
+BACKGROUND, FIXED, MOVING = 0, 1, 3  # pixel labels: background, static geometry, movable bodies
 
-# (camera, ascending steps, problems) -> one image a step; None for one that has a problem
+# (camera, ascending steps, problems) -> one image per step; None on error
 ReadImages = Callable[[int, Sequence[int], "Problems"], Iterator[np.ndarray | None]]
 
 
 class Problems:
-    """What is wrong with a scene: the first problem is raised as InputError, or all are collected in ``found``."""
+    """Error sink of the readers: raises the first problem as InputError, or collects all of them in ``found``."""
 
     def __init__(self, collect: bool = False):
         self.collect = collect
         self.found: list[str] = []
 
     def add(self, message: str) -> None:
-        """Raises or keeps one problem."""
+        """Raises or records a problem."""
         if not self.collect:
             raise InputError(message)
         self.found.append(message)
@@ -41,11 +41,11 @@ class Problems:
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """A lens with distortion.
+    """Lens distortion in OpenCV's parametrisation.
 
     Attributes:
-        coefficients: OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]], or k1 k2 k3 k4 of its fisheye model.
-        fisheye: which of both.
+        coefficients: k1 k2 p1 p2 [k3 [k4 k5 k6]], or k1 k2 k3 k4 of the fisheye model.
+        fisheye: whether it is the fisheye model.
     """
 
     coefficients: np.ndarray
@@ -61,11 +61,11 @@ class Camera:
     """One camera of a recording, in gsim3d's conventions.
 
     Attributes:
-        name: as messages show it.
+        name: name for messages.
         size: (width, height) of its images.
-        viewmats: [4, 4], or [n_steps, 4, 4] where it moves.
+        viewmats: world-to-camera [4, 4], or [n_steps, 4, 4] if it moves.
         Ks: [3, 3], or [n_steps, 3, 3].
-        lens: None: a pinhole.
+        lens: distortion; None for a pinhole.
     """
 
     name: str
@@ -77,25 +77,25 @@ class Camera:
 
 @dataclass(frozen=True)
 class Recording:
-    """One scene as its reader found it, in gsim3d's conventions (OpenCV axes, pixel centres at +0.5, metres).
+    """One recorded scene in gsim3d's conventions (OpenCV axes, pixel centres at +0.5, metres).
 
     Attributes:
         layout: name of the layout.
         source: file that describes the cameras.
-        n_steps: steps.
-        fps: steps a second.
-        camera_names: V names, as messages show them.
-        viewmats: float64 [S, V, 4, 4]; S is 1 for cameras that stand still, else n_steps.
-        Ks: float64 [S, V, 3, 3]; S is 1 or n_steps here, too.
+        n_steps: number of steps.
+        fps: steps per second.
+        camera_names: V names, for messages.
+        viewmats: float64 [S, V, 4, 4], world-to-camera; S is 1 for static cameras, else n_steps.
+        Ks: float64 [S, V, 3, 3]; S is 1 or n_steps.
         sizes: (width, height) of each camera's images.
-        read_images: uint8 [h, w, 3], RGB.
-        read_labels: uint8 [h, w] of BACKGROUND, FIXED, MOVING; None: no labels.
-        distortions: lens of each camera, None for a pinhole; images are not undistorted yet.
-        near, far, origin, bounds: None where the description has none.
-        real_background: labels of 0 mean a real background, which is painted black.
-        subtract_background: labels come from what differs from the median image of the camera.
-        notes: what was left out or changed on reading; check-data prints them.
-        world_offset: float64 [3], what all positions count from; 0 in what readers return.
+        read_images: reader of images, uint8 RGB [h, w, 3].
+        read_labels: reader of labels, uint8 [h, w] of BACKGROUND, FIXED, MOVING; None if there are no labels.
+        distortions: lens of each camera, None for a pinhole; images are still distorted.
+        near, far, origin, bounds: None if the description does not give them.
+        real_background: the images show a real background, which is masked to black where labels are 0.
+        subtract_background: derive labels by background subtraction.
+        notes: remarks about skipped or changed data; check-data prints them.
+        world_offset: float64 [3] metres, origin of all positions in the coordinates of the files; readers return 0.
     """
 
     layout: str
@@ -120,7 +120,7 @@ class Recording:
 
     @classmethod
     def of_cameras(cls, cameras: Sequence[Camera], n_steps: int, **others: Any) -> Recording:
-        """A recording of ``cameras``; ``others`` are its other attributes."""
+        """Builds a recording from ``cameras``; ``others`` are the remaining attributes."""
         return cls(
             n_steps=n_steps,
             camera_names=tuple(camera.name for camera in cameras),
@@ -132,24 +132,24 @@ class Recording:
         )
 
     def cameras_at_step(self, step: int) -> tuple[np.ndarray, np.ndarray]:
-        """viewmats [V, 4, 4] and Ks [V, 3, 3] of a step."""
+        """Returns viewmats [V, 4, 4] and Ks [V, 3, 3] of a step."""
         return tuple(values[step if len(values) > 1 else 0] for values in (self.viewmats, self.Ks))
 
 
 def _by_step(matrices: Sequence[np.ndarray], n_steps: int) -> np.ndarray:
-    """[S, V, ...] of V cameras with [...] each that stands still or [n_steps, ...] that moves; S is 1 if none moves."""
+    """Stacks V matrices [...] (static) or [n_steps, ...] (moving) to [S, V, ...]; S is 1 if all are static."""
     full = np.stack([np.broadcast_to(matrix, (n_steps, *matrix.shape[-2:])) for matrix in matrices], 1)
     return full[:1].copy() if (full == full[:1]).all() else full
 
 
 @dataclass(frozen=True)
 class Description:
-    """A JSON object whose values are checked as they are read.
+    """A JSON object with validating accessors.
 
     Attributes:
         values: the object.
-        where: start of the messages on its values, such as "metadata.json: cam_0.".
-        problems: what is wrong is added to them.
+        where: prefix of error messages, such as "metadata.json: cam_0.".
+        problems: receives the errors found.
     """
 
     values: Mapping[str, Any]
@@ -157,7 +157,7 @@ class Description:
     problems: Problems
 
     def whole(self, key: str, limit: int) -> int:
-        """A whole number from 1 to ``limit``; 1 where it is none."""
+        """Returns an integer from 1 to ``limit``; 1 on error."""
         value = self.values.get(key)
         if not _is_number(value) or value != value // 1 or not 1 <= value <= limit:
             self.problems.add(f"{self.where}{key} must be a whole number from 1 to {limit}; got {value!r:.80}")
@@ -165,7 +165,7 @@ class Description:
         return int(value)
 
     def positive(self, key: str) -> float | None:
-        """A positive number; None where it is none or absent."""
+        """Returns a positive number; None if absent or on error."""
         value = self.values.get(key)
         if value is None:
             return None
@@ -175,11 +175,11 @@ class Description:
         return float(value)
 
     def array(self, key: str, *shapes: tuple[int, ...]) -> np.ndarray | None:
-        """Finite float64 numbers of one of ``shapes``; None where they are not."""
+        """Returns a finite float64 array of one of ``shapes``; None on error."""
         return array(self.values.get(key), shapes, f"{self.where}{key}", self.problems)
 
     def size(self, key: str) -> tuple[int, int]:
-        """(width, height) of an image; (1, 1) where it is none."""
+        """Returns (width, height) of an image; (1, 1) on error."""
         size = self.array(key, (2,))
         if size is None:
             return 1, 1
@@ -189,11 +189,11 @@ class Description:
         return int(size[0]), int(size[1])
 
     def workspace(self, near: float | None = None, far: float | None = None, unit: float = 1.0) -> dict[str, Any]:
-        """The keys of every layout: near, far, origin and bounds in metres.
+        """Returns the keys common to all layouts, near, far, origin and bounds, in metres.
 
         Args:
-            near, far: metres, where the description has none.
-            unit: metres of one unit of the description.
+            near, far: defaults in metres.
+            unit: metres per unit of the description.
         """
         found: dict[str, Any] = {key: self.positive(key) for key in ("near", "far")}
         if None not in found.values() and found["far"] <= found["near"]:
@@ -214,7 +214,7 @@ def _is_number(value: Any) -> bool:
 
 
 def array(value: Any, shapes: Sequence[tuple[int, ...]], what: str, problems: Problems) -> np.ndarray | None:
-    """``value`` as finite float64 numbers of one of ``shapes``; None, and a problem of ``what``, where it is not."""
+    """Converts ``value`` to a finite float64 array of one of ``shapes``; reports errors of ``what``, returns None."""
     if value is None:
         problems.add(f"{what} is missing")
         return None
@@ -232,16 +232,16 @@ def array(value: Any, shapes: Sequence[tuple[int, ...]], what: str, problems: Pr
         index = np.argwhere(~np.isfinite(numbers))[0]
         frame = f" (frame {index[0]})" if len(shapes) > 1 and numbers.ndim == max(map(len, shapes)) else ""
         null = given.dtype.kind == "O" and given[tuple(index)] is None
-        problems.add(f"{what}{frame} holds {'null' if null else 'values that are not finite'}")
+        problems.add(f"{what}{frame} contains {'null' if null else 'values that are not finite'}")
         return None
     if (np.abs(numbers) > MAX_NUMBER).any():
-        problems.add(f"{what} holds {np.abs(numbers).max():g}; numbers beyond {MAX_NUMBER:g} are taken to be broken")
+        problems.add(f"{what} contains {np.abs(numbers).max():g}; magnitudes above {MAX_NUMBER:g} are not allowed")
         return None
     return numbers
 
 
 def read_json(file: Path) -> dict:
-    """The JSON object in ``file``. Raises InputError when it cannot be read or is none."""
+    """Reads the JSON object in ``file``. Raises InputError if it cannot be read or is not an object."""
     content = read_file(file, MAX_TEXT)
     try:
         text = content.decode(json.detect_encoding(content))
@@ -250,17 +250,17 @@ def read_json(file: Path) -> dict:
         raise InputError(f"{file} cannot be read: {error}") from error
     if not isinstance(content, dict):
         raise InputError(f"{file} must hold a JSON object; got {type(content).__name__}")
-    if HALF_PAIR.search(text):  # no file and no terminal takes half of a pair
+    if HALF_PAIR.search(text):  # unpaired surrogates cannot be encoded for file names and messages
         try:
             json.dumps(content, ensure_ascii=False).encode()
         except UnicodeEncodeError as error:
             half = error.object[error.start]
-            raise InputError(f"{file} cannot be read: it holds half of a surrogate pair, {half!a}") from None
+            raise InputError(f"{file} cannot be read: it contains an unpaired surrogate, {half!a}") from None
     return content
 
 
 def inside(folder: Path, relative: str, what: str) -> Path:
-    """``folder / relative``. Raises InputError when that is no file inside of ``folder``, links followed."""
+    """Returns ``folder / relative``. Raises InputError if it resolves to a path outside of ``folder``."""
     file = folder / relative
     try:
         root, target = folder.resolve(), file.resolve()
@@ -268,22 +268,22 @@ def inside(folder: Path, relative: str, what: str) -> Path:
             return file
     except (OSError, ValueError, RuntimeError):
         pass
-    raise InputError(f"{what} is no file or leads out of the scene: {str(relative)[:200]!r}")
+    raise InputError(f"{what} is not a file inside the scene folder: {str(relative)[:200]!r}")
 
 
 def natural_order(text: str) -> list:
-    """Sort key by which frame2 comes before frame10."""
+    """Returns a sort key that orders frame2 before frame10."""
     return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", text)]
 
 
 def trailing_number(name: str) -> int | None:
-    """The last number in a file name without its ending."""
+    """Returns the last number in a file name without suffix; None if there is none."""
     digits = re.findall(r"\d+", name)
     return int(digits[-1]) if digits and len(digits[-1]) <= 9 else None
 
 
 def common_numbers(numbers: dict[str, Sequence[int]], source: Path, problems: Problems) -> list[int]:
-    """Frame numbers that all cameras have, evenly spaced; frames that a camera lacks are a problem."""
+    """Returns the frame numbers that all cameras have; reports missing frames and uneven spacing."""
     every = sorted(set().union(*numbers.values()))
     for camera, own in numbers.items():
         missing = sorted(set(every) - set(own))
@@ -299,14 +299,14 @@ def common_numbers(numbers: dict[str, Sequence[int]], source: Path, problems: Pr
     if len(gaps) and (gaps != gaps.min()).any() and common == every:
         late = int(np.argmax(gaps != gaps.min()))
         problems.add(
-            f"{source}: frame numbers are times and must be evenly spaced; from frame {common[late]} on the next is "
-            f"{common[late + 1]}, but elsewhere {gaps.min()} later"
+            f"{source}: frame numbers are times and must be evenly spaced by {gaps.min()}; frame {common[late]} is "
+            f"followed by frame {common[late + 1]}"
         )
     return common
 
 
 def step_rate(times: np.ndarray) -> tuple[float, int | None]:
-    """Steps a second of ascending ``times``, and the first step after which the spacing breaks (None: it does not)."""
+    """Returns the rate (1/s) of ascending ``times``, and the index of the first uneven step (None if even)."""
     gaps = np.diff(times)
     usual = float(np.median(gaps))
     broken = np.abs(gaps - usual) > SPACING_TOLERANCE * usual

@@ -1,4 +1,4 @@
-"""One recorded scene, whatever the layout of its folder: images, labels and cameras of every step."""
+"""Scene: images, labels and cameras of a recorded scene, independent of its layout on disk."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ from gsim3d.data.masks import foreground, median_image
 from gsim3d.data.recording import BACKGROUND, MOVING, Problems, ReadImages, Recording
 from gsim3d.errors import InputError
 
-CACHE_VERSION = 2  # counts changes of what readers make of the same files
-SIZE_MULTIPLE = 16  # pixels; images are padded to it, so that the encoders of all presets can read them
+CACHE_VERSION = 2  # increase when readers decode the same files differently
+SIZE_MULTIPLE = 16  # pixels; image sizes are padded to a multiple, which the encoders of all presets accept
 
 
 class Scene:
     """One recorded scene.
 
     Attributes:
-        path: folder.
-        name: its last two parts.
-        layout: of the folder, see :mod:`gsim3d.data.layouts`.
-        recording: cameras and readers, fitted as ``fitting`` says.
-        recorded_sizes: (width, height) of each camera's images, before they are fitted.
-        fitting: what was done to the recording.
-        n_steps, n_cams: steps and cameras.
-        fps: steps a second.
-        camera_names: as messages show them.
-        near, far: metres, the depth range in which the scene lies.
-        width, height: pixels of all images: those of the largest camera, padded on the right and below to multiples of
-            16.
+        path: scene folder.
+        name: last two components of the path.
+        layout: name of the layout, see :mod:`gsim3d.data.layouts`.
+        recording: cameras and readers, converted as ``fitting`` specifies.
+        recorded_sizes: (width, height) of each camera's images as recorded.
+        fitting: conversion of the recording.
+        n_steps, n_cams: number of steps and cameras.
+        fps: steps per second.
+        camera_names: names for messages.
+        near, far: depth range of the scene in metres.
+        width, height: size of all images in pixels: the largest camera's, padded at the right and bottom to multiples
+            of 16.
         origin: float64 [3] metres, lower corner of the workspace.
-        world_offset: float64 [3] metres, the point that cameras, origin and bounds count from, so that float32 holds
-            them: a position plus it has the coordinates of the scene's files. 0, except for scenes far from 0.
+        world_offset: float64 [3] metres, translation that makes coordinates small enough for float32: position +
+            ``world_offset`` is in the coordinates of the files. 0 unless the scene is far from the origin.
     """
 
     def __init__(
@@ -84,17 +84,16 @@ class Scene:
         fitting: Fitting = Fitting(),
         fps: float | None = None,
     ) -> Scene:
-        """The scene in ``folder``, whose images are decoded when they are first read, each once.
+        """Opens a scene folder; images are decoded once, when first read.
 
         Args:
-            folder: of any layout.
-            cache_dir: folder for decoded images in files, for sets larger than the memory; default: they stay in
-                memory.
-            fitting: image size, depth range and unit of a model; default: as recorded.
-            fps: frames per second; of a recording with k times as many every k-th is kept. Default: all.
+            folder: scene folder of any layout.
+            cache_dir: folder to cache decoded images in, for data sets larger than memory. Default: cache in memory.
+            fitting: image size, depth range and unit of a model. Default: as recorded.
+            fps: frame rate to subsample to; must divide the recording's rate. Default: all frames.
 
         Raises:
-            InputError: names file, camera and frame, and what is wrong with it.
+            InputError: a file is invalid; names file, camera and frame.
         """
         path = Path(folder)
         problems = Problems()
@@ -106,12 +105,12 @@ class Scene:
 
     @cached_property
     def bounds(self) -> np.ndarray:
-        """float64 [2, 3] metres, corners of the box around the scene: given, or what most cameras see."""
+        """Bounding box of the scene, float64 [2, 3] metres; if not given, the region that most cameras see."""
         return shared_view(*self._view()) if self.recording.bounds is None else self.recording.bounds
 
     @property
     def own_depths(self) -> tuple[float, float] | None:
-        """near and far without ``fitting.near_far``; None where they do not follow from the recording."""
+        """near and far before ``fitting.near_far`` is applied; None if the recording does not determine them."""
         return own_depths(fit(self._recorded, Fitting(unit_cameras=self.fitting.unit_cameras)))
 
     def _view(self) -> tuple:
@@ -125,9 +124,9 @@ class Scene:
         )
 
     def cameras_at(self, cams, steps) -> Cameras:
-        """Cameras ``cams`` at each of ``steps``: len(steps) * len(cams) of them, step by step.
+        """Returns the len(steps) * len(cams) cameras at ``steps`` x ``cams``, ordered by step.
 
-        ``image_cloud`` counts the steps from 0. Steps beyond the end have the cameras of the last one.
+        ``image_cloud`` counts the steps from 0. Steps past the end use the cameras of the last step.
         """
         steps = [min(int(step), self.n_steps - 1) for step in steps]
         steps, cams = self._numbers(cams, steps)
@@ -148,16 +147,16 @@ class Scene:
 
     @property
     def cameras_move(self) -> bool:
-        """Whether a camera's pose or intrinsics change with time."""
+        """Whether poses or intrinsics change over time."""
         return len(self.recording.viewmats) > 1 or len(self.recording.Ks) > 1
 
     def images(self, cams, steps) -> Tensor:
-        """uint8 [len(steps), len(cams), 3, H, W], RGB.
+        """Returns RGB images, uint8 [len(steps), len(cams), 3, H, W].
 
-        Padding is black; so is the real background of scenes with labels, because it is not simulated.
+        Padding is black. So is the background of real scenes with labels, because it is not simulated.
 
         Args:
-            cams, steps: numbers of cameras and steps.
+            cams, steps: indices of cameras and steps.
         """
         images = self.recorded_images(cams, steps)
         if self.recording.real_background and self.has_segmentation():
@@ -165,24 +164,24 @@ class Scene:
         return images
 
     def recorded_images(self, cams, steps) -> Tensor:
-        """As :meth:`images`, background included."""
+        """Returns images as :meth:`images` does, with the background."""
         images = self._images.get(*self._numbers(cams, steps))
         return torch.from_numpy(images).permute(0, 1, 4, 2, 3).contiguous()
 
     def segmentation(self, cams, steps) -> Tensor:
-        """uint8 [len(steps), len(cams), H, W]: 0 background, 1 ground and fixed parts, 3 bodies that may move."""
+        """Returns labels, uint8 [len(steps), len(cams), H, W]: 0 background, 1 static geometry, 3 movable bodies."""
         if not self.has_segmentation():
-            raise InputError(f"{self.path}: the scene has no labels of what is background and what moves")
+            raise InputError(f"{self.path}: the scene has no segmentation labels")
         return torch.from_numpy(self._labels.get(*self._numbers(cams, steps)))
 
     def has_segmentation(self) -> bool:
-        """Whether there are labels: the scene comes with some, or its background can be subtracted."""
+        """Returns whether the scene has labels, recorded or by background subtraction."""
         return self.recording.read_labels is not None or self.recording.subtract_background
 
     def valid(self, cams, steps) -> Tensor | None:
-        """bool [len(steps), len(cams), H, W], pixels that were recorded: no padding, no border of undistortion.
+        """Returns bool [len(steps), len(cams), H, W]: pixels that are neither padding nor outside the distorted image.
 
-        None where all were.
+        None if all pixels are valid.
         """
         steps, cams = self._numbers(cams, steps)
         full = all(self.recording.sizes[cam] == (self.width, self.height) for cam in cams)
@@ -198,12 +197,13 @@ class Scene:
         return valid
 
     def input_frames(self, inputs: InputSpec, *, start: int = 0, cams: Sequence[int] | None = None) -> Frames:
-        """What a simulator takes as input of the scene (:class:`gsim3d.cameras.FrameSource`).
+        """Returns input frames for a simulator (:class:`gsim3d.cameras.FrameSource`).
 
         Args:
-            inputs: of a simulator.
+            inputs: input specification of the simulator.
             start: first step.
-            cams: cameras; None: as many as in training, spread evenly over those that may be an input.
+            cams: camera indices. Default: the number used in training, evenly spaced over the cameras allowed as input.
+
         Raises:
             InputError: the scene has too few steps or cameras.
         """
@@ -211,12 +211,12 @@ class Scene:
 
         if not 0 <= start <= self.n_steps - inputs.history:
             raise InputError(
-                f"{self.path}: {inputs.history} steps from step {start} on do not fit its {self.n_steps} steps"
+                f"{self.path}: needs {inputs.history} steps from step {start}, but the scene has {self.n_steps} steps"
             )
         if cams is None:
             known = all(cam < self.n_cams for cam in (*inputs.context_cameras, *inputs.target_only_cameras))
-            kept = set(inputs.target_only_cameras) if known else set()
-            allowed = [cam for cam in (known and inputs.context_cameras) or range(self.n_cams) if cam not in kept]
+            excluded = set(inputs.target_only_cameras) if known else set()
+            allowed = [cam for cam in (known and inputs.context_cameras) or range(self.n_cams) if cam not in excluded]
             n = min(inputs.context_views, len(allowed))
             cams = sorted(allowed[k * len(allowed) // n] for k in range(n))
         steps = range(start, start + inputs.history)
@@ -234,7 +234,7 @@ class Scene:
         return self.recording.cameras_at_step(step)[1][cam]
 
     def with_images(self, read_images: ReadImages) -> Scene:
-        """The scene with other images, of ``recorded_sizes``: they are fitted and undistorted as its own are."""
+        """Returns the scene with its images replaced; ``read_images`` yields images of ``recorded_sizes``."""
         return Scene(self.path, dataclasses.replace(self._recorded, read_images=read_images), None, self.fitting)
 
     def _read_images(self, cam: int, steps: Sequence[int]) -> Iterator[np.ndarray]:
@@ -272,20 +272,20 @@ class Scene:
         try:
             padded = np.zeros((self.height, self.width, *image.shape[2:]), image.dtype)
         except MemoryError:
-            raise InputError(f"{self.path}: no memory for images of {self.width}x{self.height} pixels") from None
+            raise InputError(f"{self.path}: out of memory for images of {self.width}x{self.height} pixels") from None
         padded[: image.shape[0], : image.shape[1]] = image
         return padded
 
 
 def _depths(recording: Recording) -> tuple[float, float]:
-    """near and far: given, or around the point that the cameras look at."""
+    """Returns near and far in metres, given or estimated from the cameras."""
     depths = own_depths(recording)
     if depths is None:
         raise InputError(
-            f"{recording.source}: near and far (metres) are needed: the cameras look at no common point that "
-            "would give the distance of the scene"
+            f"{recording.source}: near and far (metres) are needed: they cannot be estimated, because the cameras do "
+            "not look at a common point"
         )
     near, far = depths
-    if not 0 < np.float32(near) < np.float32(far):  # as cameras hold them
+    if not 0 < np.float32(near) < np.float32(far):  # Cameras stores float32
         raise InputError(f"{recording.source}: far must lie beyond near; got near {near:g} and far {far:g}")
     return near, far

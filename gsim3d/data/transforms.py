@@ -1,7 +1,7 @@
-"""Nerfstudio's transforms.json, with a time for every frame and any number of cameras; and NeRF-synthetic's splits.
+"""Reader of Nerfstudio's transforms.json with frame times and any number of cameras, and of NeRF-synthetic splits.
 
-Keys of the file are those of every frame that does not have them itself. Frames without ``camera`` are of one camera
-where their paths differ only in the last number. All keys: docs/reference/data.md.
+Top-level keys are defaults of every frame. Frames without ``camera`` belong to one camera if their paths differ only in
+the last number. All keys: docs/reference/data.md.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ NAME = "transforms"
 FILE = "transforms.json"
 SPLITS = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 ANGLES = ("camera_angle_x", "camera_angle_y")
-OWN = ("frames", "file_path", "transform_matrix", "time", "camera", "mask_path", "label_path")  # others may be shared
-SAME_TIME = 1e-6  # of the whole duration: times closer than that are one step
+OWN = ("frames", "file_path", "transform_matrix", "time", "camera", "mask_path", "label_path")  # never defaults
+SAME_TIME = 1e-6  # fraction of the duration; closer times belong to one step
 
 
 def recognises(folder: Path) -> bool:
-    """Whether ``folder`` has a transforms.json, or splits of NeRF-synthetic."""
+    """Returns whether ``folder`` has a transforms.json or NeRF-synthetic splits."""
     return any((folder / name).is_file() for name in (FILE, *SPLITS))
 
 
 def read(folder: Path, problems: Problems) -> Recording:
-    """The scene in ``folder``. Raises InputError where its description cannot be read at all."""
+    """Reads the scene in ``folder``. Raises InputError if its description cannot be parsed."""
     sources = [folder / name for name in (FILE, *SPLITS) if (folder / name).is_file()]
     source, *splits = sources[:1] if sources[0].name == FILE else sources
     description, notes = read_json(source), []
@@ -43,28 +43,28 @@ def read(folder: Path, problems: Problems) -> Recording:
         more = frames_of(folder, other, read_json(other))
         if _times(more) == _times(frames):
             frames += more
-            notes.append(f"the views of {other.name} are cameras, too")
+            notes.append(f"the views of {other.name} are added as cameras")
         else:
-            notes.append(f"{other.name} has other times than {source.name} and is left out")
+            notes.append(f"{other.name} is ignored: its times differ from those of {source.name}")
     return dataclasses.replace(recording_of(folder, source, description, frames, problems), notes=tuple(notes))
 
 
 def recording_of(folder: Path, source: Path, description: dict, frames: list[dict], problems: Problems) -> Recording:
-    """The scene of ``frames``.
+    """Builds a recording from frames in Nerfstudio's format.
 
     Args:
-        folder: of the scene; paths of the frames lie in it.
-        source: file that describes the scene.
+        folder: scene folder, to which the paths of the frames are relative.
+        source: file that describes the scene, for messages.
         description: fps, near, far, origin and bounds.
-        frames: each with all its keys, see :func:`frames_of`.
-        problems: what is wrong is added to them.
+        frames: frames with all their keys, see :func:`frames_of`.
+        problems: receives the errors found.
     """
     if len(frames) > recording.MAX_STEPS:
-        raise InputError(f"{source}: {len(frames)} frames; more than {recording.MAX_STEPS} are taken to be a mistake")
+        raise InputError(f"{source}: {len(frames)} frames exceed the limit of {recording.MAX_STEPS}")
     table, times = _table(frames, source, problems)
     names = sorted(table, key=recording.natural_order)
     if len(names) > recording.MAX_CAMS:
-        raise InputError(f"{source}: {len(names)} cameras; more than {recording.MAX_CAMS} are taken to be a mistake")
+        raise InputError(f"{source}: {len(names)} cameras exceed the limit of {recording.MAX_CAMS}")
     cameras = [_CameraFrames(name, table[name], folder, source, problems) for name in names]
     given = Description(description, f"{source}: ", problems)
     fps = given.positive("fps")
@@ -72,8 +72,8 @@ def recording_of(folder: Path, source: Path, description: dict, frames: list[dic
         rate, broken = recording.step_rate(times)
         if broken is not None:
             problems.add(
-                f"{source}: times must be evenly spaced; after {times[broken]:g} the next is {times[broken + 1]:g}, "
-                f"elsewhere {1 / rate:g} later"
+                f"{source}: times must be evenly spaced by {1 / rate:g}; {times[broken]:g} is followed by "
+                f"{times[broken + 1]:g}"
             )
         fps = fps or rate
     has_labels = any("mask_path" in frame or "label_path" in frame for frame in frames)
@@ -92,7 +92,7 @@ def recording_of(folder: Path, source: Path, description: dict, frames: list[dic
             if key in frame:
                 yield from camera.read(key, convert, [step], problems)
             else:
-                problems.add(f"{source}: {camera.frame(step)} has no mask_path, though other frames have one")
+                problems.add(f"{source}: {camera.frame(step)} has no mask_path, but other frames have one")
                 yield None
 
     return Recording.of_cameras(
@@ -109,7 +109,7 @@ def recording_of(folder: Path, source: Path, description: dict, frames: list[dic
 
 
 def frames_of(folder: Path, source: Path, description: dict) -> list[dict]:
-    """The frames of a file, with its keys in each; their paths lie in the folder."""
+    """Returns the frames of a description with its top-level keys as defaults; validates that paths are in folder."""
     frames = description.get("frames")
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise InputError(f"{source}: frames must be a list of one or more JSON objects")
@@ -118,7 +118,7 @@ def frames_of(folder: Path, source: Path, description: dict) -> list[dict]:
             if key != "file_path" and key not in frame:
                 continue
             if not isinstance(frame.get(key), str):
-                raise InputError(f"{source}: frames[{number}].{key} must be text; got {str(frame.get(key))[:80]!r}")
+                raise InputError(f"{source}: frames[{number}].{key} must be a string; got {str(frame.get(key))[:80]!r}")
             inside(folder, frame[key], f"{source}: frames[{number}].{key}")
     shared = {key: value for key, value in description.items() if key not in OWN}
     return [{**shared, **frame} for frame in frames]
@@ -129,18 +129,18 @@ def _times(frames: list[dict]) -> set[str]:
 
 
 def _table(frames: list[dict], source: Path, problems: Problems) -> tuple[dict, np.ndarray]:
-    """(camera -> its frames step by step, times of the steps)."""
+    """Groups frames by camera. Returns (camera name -> its frames ordered by step, times of the steps)."""
     timeless = [number for number, frame in enumerate(frames) if "time" not in frame]
     if len(timeless) == len(frames):
         table = {str(frame.get("camera", Path(frame["file_path"]))): [frame] for frame in frames}
         if len(table) < len(frames):
             raise InputError(
-                f"{source}: {len(frames)} frames without time are of {len(table)} cameras; give every frame its time"
+                f"{source}: {len(frames)} frames of {len(table)} cameras have no time; give every frame a time"
             )
         return table, np.zeros(1)
     if timeless:
         raise InputError(
-            f"{source}: frames[{timeless[0]}] ({frames[timeless[0]]['file_path']}) has no time, others have"
+            f"{source}: frames[{timeless[0]}] ({frames[timeless[0]]['file_path']}) has no time, but other frames have"
         )
     stamps = array([frame["time"] for frame in frames], [(len(frames),)], f"{source}: time of frames", problems)
     if stamps is None:
@@ -164,8 +164,8 @@ def _table(frames: list[dict], source: Path, problems: Problems) -> tuple[dict, 
         if missing:
             problems.add(
                 f"{source}: camera {name} has {len(times) - len(missing)} frames, but there are {len(times)} times; "
-                f"missing: time {times[missing[0]]:g} (frame {missing[0]}); if frames of several cameras were taken "
-                "for one, or the reverse, give every frame its camera"
+                f"missing: time {times[missing[0]]:g} (frame {missing[0]}); if frames were grouped into cameras "
+                "wrongly, give every frame its camera"
             )
             first = next(frame for frame in own if frame is not None)
             table[name] = [frame or first for frame in own]
@@ -179,14 +179,14 @@ def _camera_name(frame: dict) -> str:
 
 
 class _CameraFrames:
-    """All frames of one camera, step by step."""
+    """All frames of one camera, ordered by step."""
 
     def __init__(self, name: str, frames: list[dict], folder: Path, source: Path, problems: Problems):
         self.name, self.frames, self._folder, self._source, self._problems = name, frames, folder, source, problems
         self.size = self._size()
 
     def camera(self) -> Camera:
-        """Lens, poses and intrinsics of all steps."""
+        """Returns the camera with lens, poses and intrinsics of all steps."""
         steps = range(len(self.frames))
         found = [
             lenses.lens_of(frame, f"{self._source}: {self.frame(step)}", self._problems)
@@ -200,21 +200,21 @@ class _CameraFrames:
         return Camera(self.name, self.size, viewmats, np.stack([self._K(step) for step in steps]), found[0])
 
     def frame(self, step: int) -> str:
-        """Camera and frame, for messages."""
+        """Returns "camera, frame" for messages."""
         return f"camera {self.name}, frame {step}"
 
     def read(self, key: str, convert, steps: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:
-        """``convert`` of the images that ``key`` names at ``steps``."""
+        """Reads and converts the images at ``steps`` whose paths are stored under ``key``."""
         return read_files((self._file(key, step) for step in steps), self.size, convert, problems)
 
     def has_alpha(self) -> bool:
-        """Whether its first image has transparency."""
+        """Returns whether the first image has an alpha channel."""
         header = header_of(*self._file("file_path", 0), Problems(collect=True))
         return header is not None and header.alpha
 
     def _file(self, key: str, step: int) -> tuple[Path, str]:
         file = inside(self._folder, self.frames[step][key], f"{self._source}: {key} of {self.frame(step)}")
-        if file.suffix.lower() not in IMAGE_SUFFIXES:  # as in the synthetic sets
+        if file.suffix.lower() not in IMAGE_SUFFIXES:  # NeRF-synthetic omits the suffix
             found = [file.with_name(file.name + suffix) for suffix in IMAGE_SUFFIXES]
             file = next((path for path in found if path.is_file()), found[0])
         return file, self.frame(step)
@@ -239,12 +239,12 @@ class _CameraFrames:
         frame, what, problems = self.frames[step], f"{self._source}: intrinsics of {self.frame(step)}", self._problems
         size = [frame.get(key) for key in ("w", "h")]
         if size != list(self.size) and size != [None, None]:
-            problems.add(f"{what}: w, h are {size}, but {list(self.size)} in its first frame")
+            problems.add(f"{what}: w, h are {size}, but {list(self.size)} in the camera's first frame")
         keys = ("fl_x", "fl_y", "cx", "cy")
         given = {key: frame[key] for key in keys if frame.get(key) is not None}
         angles = [self._focal(Description(frame, f"{what}: ", problems), axis) for axis in (0, 1)]
         known = {"fl_x": angles[0] or angles[1], "fl_y": angles[1] or given.get("fl_x") or angles[0]}
-        if any(angles):  # they are symmetric
+        if any(angles):  # fields of view are symmetric, so the principal point defaults to the centre
             known |= {"cx": self.size[0] / 2, "cy": self.size[1] / 2}
         given = {key: value for key, value in known.items() if value is not None} | given
         missing = [key for key in keys if key not in given]
@@ -259,7 +259,7 @@ class _CameraFrames:
         return K if check_intrinsics(K, self.size, what, problems) else np.eye(3)
 
     def _focal(self, frame: Description, axis: int) -> float | None:
-        """The focal length in pixels of the angle that an axis of the image spans; None where it is not given."""
+        """Returns the focal length in pixels from the field of view along an image axis; None if not given."""
         angle = frame.positive(ANGLES[axis])
         if angle is None:
             return None

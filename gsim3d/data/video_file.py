@@ -1,4 +1,4 @@
-"""Video files: frames counted by decoding, their times as stored in the file, and pixels."""
+"""Reading of video files: frame times from the container, integrity checks, and frames as RGB images."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from gsim3d.data.recording import MAX_STEPS, Problems
 from gsim3d.errors import InputError
 from gsim3d.io.files import opencv_path
 
-RESOLUTION = 1.01e-3  # seconds: many containers round times to a millisecond
-UNEVEN = 0.1  # of the time between two frames: a frame that is off by more makes a video uneven
-MAX_APART, MIN_EVEN = 2, 8  # frames that may lie apart at the end, of more than so many
-TURNS = (0, 90, 180, 270)  # degrees that decoded frames are turned by
+RESOLUTION = 1.01e-3  # seconds; many containers round times to milliseconds
+UNEVEN = 0.1  # largest deviation from even spacing, as a fraction of the frame interval
+MAX_APART, MIN_EVEN = 2, 8  # isolated frames at the end that are dropped, if there are more than MIN_EVEN frames
+TURNS = (0, 90, 180, 270)  # degrees of supported display rotations
 MP4_KINDS = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
 EBML, SEGMENT = b"\x1aE\xdf\xa3", b"\x18S\x80g"
 
 
 class Video:
-    """A video file. It is opened for each read and closed after it; frames are decoded from the first one on.
+    """A video file, opened only during reads and always decoded from its first frame.
 
     Attributes:
-        numbers: of its frames, from 0; none where there is a problem.
+        numbers: frame numbers from 0; empty on error.
         times: float64 [N], seconds.
-        rate: frames a second; None where they are not evenly spaced.
-        note: frames that are left out; "" where none are.
+        rate: frames per second; None if frames are not evenly spaced.
+        note: remark about dropped frames; "" if there are none.
     """
 
     def __init__(self, file: Path, name: str, size: tuple[int, int], problems: Problems):
@@ -47,16 +47,16 @@ class Video:
         self.times = found.times[: len(found.times) - cut]
         self.numbers = list(range(len(self.times)))
         if cut:
-            self.note = f"{self.what}: its last {cut} of {len(found.times)} frames lie apart and are left out"
+            self.note = f"{self.what}: the last {cut} of {len(found.times)} frames are isolated and are dropped"
         if self.rate is None:
             gaps = (1000 * np.diff(found.times)).round(1)
             self.unevenness = (
-                f"its {len(found.times)} frames are {gaps.min():g} to {gaps.max():g} ms apart, though its header says "
-                f"{found.rate:.4g} a second"
+                f"its {len(found.times)} frames are {gaps.min():g} to {gaps.max():g} ms apart, but its header gives "
+                f"{found.rate:.4g} fps"
             )
 
     def read(self, numbers: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:
-        """The frames of ascending ``numbers``, uint8 [h, w, 3], RGB. A number may come again."""
+        """Yields the frames of ascending ``numbers`` (may repeat), uint8 RGB [h, w, 3]; None on error."""
         import cv2
 
         capture = _open(self._file, self.what + " ")
@@ -81,8 +81,8 @@ class _Scan:
     """Result of decoding a file.
 
     Attributes:
-        times: float64 [N] seconds, of all frames that can be decoded.
-        rate: as the header has it; may be nonsense.
+        times: float64 [N] seconds, of all decodable frames.
+        rate: frames per second in the header; may be invalid.
     """
 
     times: np.ndarray
@@ -91,15 +91,15 @@ class _Scan:
 
 @lru_cache(maxsize=10_000)
 def _scan(file: Path, size: tuple[int, int], stamp: tuple) -> _Scan:
-    """Times of the frames of a file, which is decoded once.
+    """Decodes a file once to get the times of its frames.
 
     Args:
         file: path.
-        size: (width, height) that it must have.
-        stamp: changes with the file.
+        size: expected (width, height).
+        stamp: modification time and size of the file, part of the cache key.
 
     Raises:
-        InputError: what is wrong, without the name of the file.
+        InputError: the file is invalid; the message does not include its name.
     """
     import cv2
 
@@ -111,9 +111,9 @@ def _scan(file: Path, size: tuple[int, int], stamp: tuple) -> _Scan:
         )
         found = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
         if turn not in TURNS or index.mirrored:
-            raise InputError("is shown mirrored or aslant by its display matrix; only quarter turns are read")
+            raise InputError("has a display matrix that is not a rotation by 0, 90, 180 or 270 degrees")
         if found != size:
-            turned = f" (turned by {turn:g} degrees, as its display matrix says)" if turn else ""
+            turned = f" (rotated by {turn:g} degrees by its display matrix)" if turn else ""
             raise InputError(f"has {found[0]}x{found[1]} pixels{turned}, its camera {size[0]}x{size[1]}")
         times, marks = [], []
         while capture.grab():
@@ -124,12 +124,12 @@ def _scan(file: Path, size: tuple[int, int], stamp: tuple) -> _Scan:
     finally:
         capture.release()
     if not times:
-        raise InputError("cannot be decoded: damaged, or of a codec that this OpenCV lacks")
+        raise InputError("cannot be decoded: it is damaged, or this OpenCV lacks its codec")
     times = np.array(times)
     back = np.flatnonzero(np.diff(times) < 0)
     if len(times) > 1 and (len(back) or times[-1] <= times[0]):
-        at = f"go back after frame {back[0]}" if len(back) else "are all equal"
-        raise InputError(f"has no usable time stamps: they {at}; convert it to a constant rate")
+        at = f"decrease after frame {back[0]}" if len(back) else "are all equal"
+        raise InputError(f"has invalid time stamps: they {at}; convert it to a constant frame rate")
     times += _start(times, np.array(marks), rate)
     if len(times) < count and index.duration:
         gap = (times[-1] - times[0]) / max(len(times) - 1, 1)
@@ -148,14 +148,14 @@ def _open(file: Path, what: str = ""):
     capture = cv2.VideoCapture(opencv_path(file), cv2.CAP_FFMPEG)
     if not capture.isOpened():
         capture.release()
-        raise InputError(f"{what}cannot be opened: broken, cut off or no video")
+        raise InputError(f"{what}cannot be opened: it is damaged, truncated or not a video")
     return capture
 
 
 def _start(times: np.ndarray, marks: np.ndarray, rate: float) -> float:
-    """Seconds from the start of the container to the first frame.
+    """Returns the time of the first frame, in seconds from the start of the container.
 
-    OpenCV counts ``times`` from that frame, and reports the container's time in ``marks``, in whole frames of ``rate``.
+    OpenCV's ``times`` are relative to that frame; ``marks`` are container times, rounded to frames at ``rate``.
     """
     if not 0 < rate < 1e6:
         return 0.0
@@ -164,10 +164,10 @@ def _start(times: np.ndarray, marks: np.ndarray, rate: float) -> float:
 
 
 def _even_part(times: np.ndarray, header: float) -> tuple[int, float | None]:
-    """How many frames at the end lie apart, and the rate of the others.
+    """Returns the number of isolated frames at the end, and the rate of the others.
 
-    Editors that cut without encoding anew leave such frames: those that were stored after them, and are shown before,
-    are gone.
+    Cutting a video without re-encoding can leave such frames: B-frames stored after them, but displayed before, are
+    lost.
     """
     for cut in range(MAX_APART + 1 if len(times) > MIN_EVEN else 1):
         rate = _even_rate(times[: len(times) - cut], header)
@@ -177,7 +177,7 @@ def _even_part(times: np.ndarray, header: float) -> tuple[int, float | None]:
 
 
 def _even_rate(times: np.ndarray, header: float) -> float | None:
-    """Frames a second, of the header or as measured; None where neither fits."""
+    """Returns frames per second from the header or measured; None if frames are not evenly spaced."""
     header = header if 0 < header < 1e6 else None
     if len(times) == 1:
         return header or 1.0
@@ -190,11 +190,11 @@ def _even_rate(times: np.ndarray, header: float) -> float | None:
 
 @dataclass(frozen=True)
 class _Index:
-    """Properties of a file that OpenCV does not report.
+    """Container metadata that OpenCV does not report.
 
     Attributes:
-        mirrored: the display matrix of an MP4 mirrors it.
-        duration: seconds of its video track without what edits cut off; None where it is not known.
+        mirrored: whether the display matrix of an MP4 mirrors the image.
+        duration: seconds of the video track after edit lists; None if unknown.
     """
 
     mirrored: bool = False
@@ -202,7 +202,7 @@ class _Index:
 
 
 def _index(file: Path) -> _Index:
-    """The index of a container. Raises InputError where it declares more bytes than the file has."""
+    """Parses a container's metadata. Raises InputError if it declares more bytes than the file has."""
     size = file.stat().st_size
     with open(file, "rb") as opened:
         start = opened.read(12)
@@ -218,14 +218,14 @@ def _index(file: Path) -> _Index:
             else:
                 return _Index()
         except (struct.error, IndexError, OverflowError):
-            return _Index()  # the decoder decides whether it can be read
+            return _Index()  # left to the decoder
     if end > size:
-        raise InputError(f"cannot be decoded to its end: it has {size} of {end} bytes; it is cut off")
+        raise InputError(f"cannot be decoded to its end: it has {size} of {end} bytes; it is truncated")
     return _Index()
 
 
 def _segment_end(file: BinaryIO) -> int:
-    """The byte at which the segment of a Matroska or WebM file ends; 0 where it is not stored, as in live videos."""
+    """Returns the byte offset of the end of a Matroska or WebM segment; 0 if not stored, as in live streams."""
 
     def number() -> int:
         first = file.read(1)[0]
@@ -243,7 +243,7 @@ def _segment_end(file: BinaryIO) -> int:
 
 
 def _mp4(file: BinaryIO, size: int) -> tuple[int, _Index]:
-    """The byte at which the last box of an MP4 or MOV file ends, and the index of its video track."""
+    """Returns the byte offset of the end of the last MP4 or MOV box, and the index of the video track."""
     end, index = 0, _Index()
     for kind, start, stop in _boxes(file, 0, size):
         if kind in (b"mdat", b"moov", b"moof"):
@@ -258,7 +258,7 @@ def _mp4(file: BinaryIO, size: int) -> tuple[int, _Index]:
 
 
 def _boxes(file: BinaryIO, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
-    """Kind, start and end of the content of each box between two offsets."""
+    """Yields kind, and start and end of the payload, of each box between two byte offsets."""
     while start + 8 <= end:
         file.seek(start)
         length, kind = struct.unpack(">I4s", file.read(8))

@@ -46,12 +46,12 @@ MAX_DRIFT = 0.5  # frames by which videos of nearly one rate may run apart
 
 
 def recognises(folder: Path) -> bool:
-    """Whether ``folder`` has a cameras.json."""
+    """Returns whether ``folder`` has a cameras.json."""
     return (folder / FILE).is_file()
 
 
 def read(folder: Path, problems: Problems) -> Recording:
-    """The scene in ``folder``. Raises InputError where its description cannot be read at all."""
+    """Reads the scene in ``folder``. Raises InputError if its description cannot be parsed."""
     source = folder / FILE
     description = Description(recording.read_json(source), f"{source}: ", problems)
     entries = _entries(description)

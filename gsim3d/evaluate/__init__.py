@@ -1,1 +1,1 @@
-"""How well a simulator predicts: metrics, the protocol, reports."""
+"""Evaluation of simulators: metrics, the prediction protocol, baselines and reports."""

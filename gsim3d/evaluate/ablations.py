@@ -1,6 +1,6 @@
-"""Ablations: one base training run, and rows that each change one thing of it, trained and scored alike.
+"""Ablation studies: a base training run and rows that each change one setting, trained and scored under equal terms.
 
-A YAML file declares the rows and the base runs; configs/ablations/paper.yaml has the paper's.
+A YAML file declares base runs and rows; configs/ablations/paper.yaml contains those of the paper.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ from gsim3d.train.restore import model_config, restore
 from gsim3d.train.samples import check_scenes, context_cameras, spread_views
 
 PAPER = Path(gsim3d.__file__).parents[1] / "configs" / "ablations" / "paper.yaml"
-PRESET = "tiny"  # of the base run, unless another or a configuration is given
+PRESET = "tiny"  # default base run
 METRICS = {"psnr_masked": "PSNR masked", "psnr": "PSNR", "psnr_body": "PSNR body"}
 METHODS = ("", "constant.", "copy.")
 TIE = 2.0  # standard errors within which a difference is a tie
 EXPLAINED = """\
-PSNR in dB, means over seeds ± their standard deviation, and of the row's own last encoded particles held still
-(constant) and the last given image (copy); masked: without background; body: what may move. A difference is the mean
-over pairs of runs with the same seed, scene by scene, ± its standard error, over scenes or over seeds, whichever is
-larger; within 2 of them it is a tie. The paper's numbers are of its own data and budget: compare differences."""
+PSNR in dB, mean ± standard deviation over seeds. Baselines in brackets: the row's own last encoded particles held still
+(constant) and the last input image (copy). Masked: foreground; body: movable bodies. A difference is the mean over
+scenes and runs with equal seeds ± its standard error, over scenes or over seeds, whichever is larger; within 2 standard
+errors it is a tie. The paper's numbers are for its own data and budget: compare differences."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,10 +51,10 @@ class Row:
     """One row of the table.
 
     Attributes:
-        name: of the row and of the folder of its runs.
-        differs: from the base run, in words.
-        paper: the published PSNR in dB, where there is one.
-        change: of the base run's configuration.
+        name: name of the row and of the folder of its runs.
+        differs: description of the difference from the base run.
+        paper: published PSNR in dB; "" if there is none.
+        change: settings that replace those of the base run.
     """
 
     name: str
@@ -64,43 +64,50 @@ class Row:
 
 
 def load_ablations(path: Path = PAPER) -> tuple[dict[str, TrainConfig], dict[str, Row]]:
-    """(base runs by preset, rows by name) of a file. Raises InputError: it is absent or holds something else."""
+    """Reads an ablation file.
+
+    Returns:
+        Base runs by preset, and rows by name.
+
+    Raises:
+        InputError: the file does not exist or is not an ablation file.
+    """
     if not path.is_file():
-        raise InputError(f"{path}: does not exist; --table names a file as configs/ablations/paper.yaml is")
+        raise InputError(f"{path}: does not exist; --table takes a file like configs/ablations/paper.yaml")
     content = read_yaml(path)
     if not isinstance(content.get("bases"), dict) or not isinstance(content.get("rows"), list):
-        raise InputError(f"{path}: must hold bases and rows")
+        raise InputError(f"{path}: must contain bases and rows")
     rows = [from_dict(Row, row, f"{path}: rows[{n}]: ") for n, row in enumerate(content["rows"])]
     bases = {name: from_dict(TrainConfig, base, f"{path}: {name}") for name, base in content["bases"].items()}
     return bases, {row.name: row for row in rows}
 
 
 def rows_named(names: str, rows: dict[str, Row]) -> list[Row]:
-    """Rows from names with commas between. Raises InputError: a name is unknown or there twice."""
+    """Returns the rows of a comma-separated list of names. Raises InputError if a name is unknown or repeated."""
     found = [name.strip() for name in names.split(",")]
     if unknown := [name for name in found if name not in rows]:
         hint = did_you_mean(unknown[0], rows)
         raise InputError(f"--rows: {unknown[0]!r} does not exist; rows: {', '.join(rows)}{hint}")
     if len(set(found)) < len(found):
-        raise InputError(f"--rows: a row is named twice in {names!r}")
+        raise InputError(f"--rows: {names!r} repeats a row")
     return [rows[name] for name in found]
 
 
 def changed(base: TrainConfig, change: dict) -> TrainConfig:
-    """The run of a row, all settings of its model and effects written out. Raises InputError: there is none."""
+    """Applies a row's change to a base run; raises InputError if the result is not a valid configuration."""
     before = {**to_dict(base), "model": to_dict(model_config(base))}
     before["effects"] = EffectsSpec.from_dict(base.effects).to_dict()
     return from_dict(TrainConfig, _changed(before, change, before["model"]))
 
 
 def _changed(before: dict, change: dict, model: dict) -> dict:
-    """``before`` with ``change``, in which a mapping may say how a value follows from the base's (see paper.yaml)."""
+    """Applies ``change`` to ``before``; a mapping may derive a value from the base's (rules: see paper.yaml)."""
     result = dict(before)
     for name, wanted in change.items():
         value = before.get(name)
         if not isinstance(wanted, dict):
             result[name] = wanted
-        elif isinstance(value, list):  # phases: those that simulate
+        elif isinstance(value, list):  # phases; changes apply to those that simulate
             result[name] = [_changed(phase, wanted, model) if phase["horizon"] else phase for phase in value]
         elif value is None or isinstance(value, dict):
             result[name] = _changed(value or {}, wanted, model)
@@ -121,13 +128,19 @@ def base_run(
     config: str | Path | None = None,
     n_steps: int | None = None,
 ) -> TrainConfig:
-    """The run that rows change: of a file of ``gsim3d train``, or of a preset, in its steps or in ``n_steps``.
+    """Returns the base run of a preset or of a ``gsim3d train`` configuration file.
+
+    Args:
+        bases: base runs by preset.
+        preset: name of a base run. Default: PRESET.
+        config: configuration file, instead of ``preset``.
+        n_steps: optimizer steps. Default: those of the configuration.
 
     Raises:
-        InputError: the preset is unknown, or both are given.
+        InputError: the preset is unknown, or both ``preset`` and ``config`` are given.
     """
     if preset is not None and config is not None:
-        raise InputError("--preset: --config describes the base run; leave one of them out")
+        raise InputError("--preset: cannot be combined with --config, which also defines the base run")
     preset = preset or PRESET
     if config is None and preset not in bases:
         hint = did_you_mean(preset, bases)
@@ -137,7 +150,7 @@ def base_run(
 
 
 def with_steps(config: TrainConfig, n_steps: int) -> TrainConfig:
-    """The run in ``n_steps`` optimizer steps, shared by its phases as before. Raises InputError: they are too few."""
+    """Rescales the phases of a run to ``n_steps`` optimizer steps in total; raises InputError if they are too few."""
     if n_steps < len(config.phases):
         raise InputError(f"--steps: must be at least {len(config.phases)}, one for each phase; got {n_steps}")
     counts = [max(1, n_steps * phase.steps // config.n_steps) for phase in config.phases]
@@ -150,21 +163,22 @@ class Study:
     """Rows of one base run on one data set.
 
     Args:
-        base: the run that rows change.
-        rows: to train; the others are compared with the first one.
-        folders: of all scenes. Those that ``gsim3d train`` holds out are scored, over the same steps and from the same
-            cameras for all rows: cameras that are no input of any row, as far as there are any.
-        n_seeds: runs of each row, which differ in their seed.
+        base: base run.
+        rows: rows to train; all are compared with the first one.
+        folders: scene folders. The scenes that ``gsim3d train`` holds out are scored, for all rows over the same steps
+            and from the same cameras: those that are not an input of any row, if there are any.
+        n_seeds: runs per row, with different seeds.
         device: "cpu" or "cuda".
+
     Raises:
-        InputError: a row does not fit the data or the base run; nothing is trained or written by then.
+        InputError: a row does not fit the data or the base run; raised before training starts.
     """
 
     def __init__(
         self, base: TrainConfig, rows: Sequence[Row], folders: Sequence[Path], *, n_seeds: int = 1, device: str = "cpu"
     ):
         if len(folders) < 2:
-            raise InputError(f"{folders[0]}: a single scene; two are needed, of which one is held out")
+            raise InputError(f"{folders[0]}: a single scene; at least two are needed, because one is held out")
         self.base, self.rows, self.n_seeds, self.device = base, list(rows), n_seeds, device
         self.train, self.test = (self._scenes(part) for part in split_scenes(folders))
         self.configs = {row.name: self._config(row) for row in rows}
@@ -176,7 +190,7 @@ class Study:
             others = sorted(set(range(scene.n_cams)) - inputs) or list(range(scene.n_cams))
             self.targets.append(list(base.data.target_only_cameras) or others)
 
-    def __getstate__(self) -> dict:  # another process opens its own scenes
+    def __getstate__(self) -> dict:  # scenes are reopened in the receiving process
         return {**self.__dict__, **{part: [s.path for s in getattr(self, part)] for part in ("train", "test")}}
 
     def __setstate__(self, state: dict) -> None:
@@ -190,13 +204,13 @@ class Study:
         try:
             config = changed(self.base, row.change)
             check_scenes(self.test, config.data, ())
-            Trainer(config, self.train, os.devnull)  # checks everything else, and writes nothing
+            Trainer(config, self.train, os.devnull)  # validates the remaining settings; writes nothing
         except InputError as error:
             raise InputError(f"row {row.name}: {error}") from None
         return config
 
     def same_as(self, name: str) -> str:
-        """The first row whose run is that of the row ``name``: itself, where no earlier one is the same."""
+        """Returns the name of the first row with the same configuration as row ``name``; may be ``name`` itself."""
         return next(other for other, config in self.configs.items() if config == self.configs[name])
 
     def run(
@@ -209,14 +223,18 @@ class Study:
         progress: bool = True,
         say: Callable[[str], None] = print,
     ) -> dict:
-        """What ablation.json holds, once all is trained and scored that was not yet. Finished runs are not repeated.
+        """Trains and scores all runs that are not finished yet.
 
         Args:
-            out: folder of the runs, of ablation.json and of ablation.md, which are written after every run.
-            together: runs at a time, each in a process of its own.
-            minutes: after which training stops; the next call goes on there.
-            progress: whether bars show how far a run is.
-            say: is called with a line for each run that ends.
+            out: folder of the runs, ablation.json and ablation.md; the tables are rewritten after every run.
+            command: command line to record in the tables.
+            together: number of runs in parallel, each in its own process.
+            minutes: time limit for training; the next call resumes.
+            progress: show progress bars.
+            say: called with a line for each finished run.
+
+        Returns:
+            The content of ablation.json.
         """
         end = time.monotonic() + 60 * minutes
         out.mkdir(parents=True, exist_ok=True)
@@ -237,7 +255,7 @@ class Study:
         return content
 
     def train_and_score(self, name: str, seed: int, folder: Path, end: float, progress: bool) -> dict:
-        """What one run scores; how far it is where training did not end by ``end``; why there is nothing to score."""
+        """Trains and scores one run; returns its scores, or its progress at time ``end``, or its failure."""
         config = dataclasses.replace(self.configs[name], seed=self.configs[name].seed + seed)
         known, asked = _read(folder / "score.json"), {
             "train": to_dict(config),
@@ -250,7 +268,7 @@ class Study:
         try:
             trainer = Trainer(config, self.train, folder, device=self.device)
             if not trainer.same_scenes:
-                raise InputError(f"{folder}: was trained on fewer scenes than are given now; use another folder")
+                raise InputError(f"{folder}: was trained on fewer scenes than given now; use another folder")
             if time.monotonic() < end:
                 trainer.run(end=end, progress=progress)
             if trainer.step < config.n_steps:
@@ -279,12 +297,12 @@ class Study:
 
 
 def inputs_of(scene: Scene, config: TrainConfig) -> list[int]:
-    """The cameras that a model of this run is given."""
+    """Returns the input cameras of a model trained by this run."""
     return spread_views(context_cameras(scene, config.data), config.data.context_views, 0)
 
 
 def _read(file: Path) -> dict:
-    """What is kept of a finished run; empty where nothing is, which costs no more than time."""
+    """Reads the stored result of a finished run; returns {} if missing or invalid, so that it is computed again."""
     try:
         known = parse_json(read_file(file, MAX_TEXT)) if file.is_file() else {}
         return known if "by_scene" in known["result"] else {}
@@ -293,7 +311,7 @@ def _read(file: Path) -> dict:
 
 
 def _results(jobs: Sequence[tuple], together: int) -> Iterator[tuple[int, dict]]:
-    """(number of a job, its result) as they end."""
+    """Yields (index of a job, its result) in order of completion."""
     if together < 2:
         yield from ((number, Study.train_and_score(*job)) for number, job in enumerate(jobs))
         return
@@ -303,13 +321,13 @@ def _results(jobs: Sequence[tuple], together: int) -> Iterator[tuple[int, dict]]
         try:
             yield from ((futures[future], future.result()) for future in as_completed(futures))
         except BrokenProcessPool:
-            raise InputError("a process was killed; call again, with fewer --together") from None
+            raise InputError("a process was killed; run again with a smaller --together") from None
         finally:
             pool.shutdown(cancel_futures=True)
 
 
 def _begin(n_threads: int) -> None:
-    """Of a process: its share of the cores and one of the GPUs; it ends when its parent is killed."""
+    """Initialises a worker process: sets its threads and GPU, and makes it exit when its parent dies."""
     torch.set_num_threads(n_threads)
     if torch.cuda.is_available():
         torch.cuda.set_device(os.getpid() % torch.cuda.device_count())
@@ -318,10 +336,12 @@ def _begin(n_threads: int) -> None:
 
 
 def as_dict(study: Study, results: dict[str, list[dict]], command: str) -> dict:
-    """What ablation.json holds: of each row its runs, their means, and the difference to the first row.
+    """Builds the content of ablation.json: runs, means, and differences from the first row, for each row.
 
     Args:
-        results: runs by the name of a row whose run is its own, as far as there are any.
+        study: the study.
+        results: finished runs by the name of their row.
+        command: command line to record.
     """
     rows = []
     for row in study.rows:
@@ -351,15 +371,18 @@ def as_dict(study: Study, results: dict[str, list[dict]], command: str) -> dict:
 
 
 def scored(runs: Sequence[dict]) -> list[dict]:
-    """Those that have ended well."""
+    """Returns the runs that finished with scores."""
     return [run for run in runs if "by_scene" in run]
 
 
 def paired_difference(runs: Sequence[dict], first: Sequence[dict], metric: str) -> dict:
-    """``difference`` between runs of two rows over pairs of seed and scene, its ``standard_error``, and ``tie``.
+    """Compares the runs of two rows, paired by seed and scene.
 
-    All scenes share the weights of a seed, and all seeds share the scenes: the standard error is the larger of those
-    over seeds and over scenes. It and the tie are None of a single pair; without pairs nothing is returned.
+    Scores of one seed share weights, and scores of one scene share data, so pairs are not independent. The standard
+    error is the larger of those over seed means and over scene means.
+
+    Returns:
+        ``difference``, ``standard_error`` and ``tie``; the last two are None for a single pair. {} without pairs.
     """
     ours, theirs = ({r["seed"]: r["by_scene"][metric] for r in scored(part)} for part in (runs, first))
     pairs = [[a - b for a, b in zip(ours[seed], theirs[seed], strict=True)] for seed in ours if seed in theirs]
@@ -373,19 +396,19 @@ def paired_difference(runs: Sequence[dict], first: Sequence[dict], metric: str) 
 
 
 def outcome(run: dict) -> str:
-    """What a run came to, in a few words."""
+    """Returns a short description of a run's result."""
     if "failure" in run:
         return f"failed: {run['failure']}"
     if "trained" in run:
-        return f"{run['trained']} of {run['of']} optimizer steps; call again to go on"
+        return f"{run['trained']} of {run['of']} optimizer steps; run again to resume"
     return ", ".join(f"{label} {run[metric]:.2f}" for metric, label in METRICS.items() if run[metric] is not None)
 
 
 def markdown(content: dict) -> str:
-    """The table, and what a reader of it must know."""
+    """Returns ablation.md: the table and its explanation."""
     rows, base, scenes, steps = (content[name] for name in ("rows", "base", "scenes", "steps"))
-    head = ["row", "what differs", *(f"{label} (constant, copy)" for label in METRICS.values())]
-    table = [[*head, f"against {rows[0]['row']}", "s a step", "paper"]]
+    head = ["row", "difference from base", *(f"{label} (constant, copy)" for label in METRICS.values())]
+    table = [[*head, f"against {rows[0]['row']}", "s per step", "paper"]]
     table.append(["---"] * len(table[0]))
     for row in rows:
         seconds = f"{row['step_seconds']:.3g}" if "step_seconds" in row else "-"
@@ -395,8 +418,8 @@ def markdown(content: dict) -> str:
     n_steps, device = sum(phase["steps"] for phase in base["phases"]), content["machine"]["device"]
     lines += [
         "",
-        f"Base run: preset {base['preset']}, {n_steps} optimizer steps. {scenes['trained']} scenes trained on, "
-        f"{scenes['held_out']} held out and scored: {steps['predicted']} steps predicted after {steps['before']}. "
+        f"Base run: preset {base['preset']}, {n_steps} optimizer steps. {scenes['trained']} training scenes, "
+        f"{scenes['held_out']} held-out scenes scored: {steps['predicted']} steps predicted after {steps['before']}. "
         f"Seeds: {content['seeds']}. {device}.",
         "",
         EXPLAINED,
@@ -418,7 +441,7 @@ def _values(row: dict, metric: str) -> str:
 
 def _against(row: dict) -> str:
     if "same_as" in row:
-        return f"is {row['same_as']}"
+        return f"same as {row['same_as']}"
     if "difference" not in row:
         return "failed" if any("failure" in run for run in row["runs"]) else "-"
     error = "" if row["standard_error"] is None else f" ± {row['standard_error']:.2f}"

@@ -1,4 +1,4 @@
-"""Two reports on the same scenes: the mean difference of each score with its paired standard error."""
+"""Comparison of two reports on the same scenes: mean difference and paired standard error of each score."""
 
 from __future__ import annotations
 
@@ -13,32 +13,36 @@ from gsim3d.errors import InputError
 from gsim3d.evaluate.scoring import METRICS
 
 PARTS = ("past", "future", "future_late")
-LEAST = 2.0  # standard errors; nothing below is called better or worse
+LEAST = 2.0  # standard errors; smaller differences are a tie
 SAME = {"n_encoded_steps": "given steps", "n_future_steps": "predicted steps"}
 
 
 def read_report(file: str | Path) -> dict:
-    """The content of a metrics.json, or of the scores of a shipped simulator, a report for each of its sets.
+    """Reads a metrics.json, or the scores of a shipped simulator, which map data sets to reports.
 
     Raises:
-        InputError: the file cannot be read, or is no report.
+        InputError: the file cannot be read or contains no report.
     """
     content = read_json(Path(file))
     if not list(_reports(content)):
-        raise InputError(f"{file}: not a report of gsim3d evaluate: it has no scores of scenes")
+        raise InputError(f"{file}: not a report of gsim3d evaluate: it has no scores of individual scenes")
     return content
 
 
 def compare(report: dict, other: dict, file: str | Path) -> dict:
-    """Scores of ``report`` less those of ``other``, of the first method of each.
+    """Subtracts the scores of ``other`` from those of ``report``, for the first method of each.
 
     Args:
-        file: where ``other`` is from, for messages.
+        report: a report, see :func:`read_report`.
+        other: the report to compare with.
+        file: file of ``other``, for messages.
+
     Returns:
-        set -> score -> difference, standard_error (None of one scene), scenes (that have a value in both), verdict.
-        A report of one set has the name "".
+        Data set ("" if the report has only one) -> score -> difference, standard_error (None for a single scene),
+        scenes (number of scenes with both values), verdict.
+
     Raises:
-        InputError: the reports share no set, or are of other scenes, steps or images.
+        InputError: the reports share no data set, or differ in scenes, steps or images.
     """
     ours, others = dict(_reports(report)), dict(_reports(other))
     shared = [name for name in ours if name in others]
@@ -48,7 +52,7 @@ def compare(report: dict, other: dict, file: str | Path) -> dict:
 
 
 def table(comparison: dict, file: str | Path) -> str:
-    """The text of what :func:`compare` returned."""
+    """Formats the result of :func:`compare` as text."""
     lines = [f"difference to {file} (mean over scenes ± paired standard error):"]
     for name, scores in comparison.items():
         lines += [f"  {name}"] if name else []
@@ -60,7 +64,7 @@ def table(comparison: dict, file: str | Path) -> str:
 
 
 def _reports(content: dict) -> Iterator[tuple[str, dict]]:
-    """The content itself, named "", or else each set in it."""
+    """Yields (data set, report); the data set is "" if ``content`` is itself a report."""
 
     def is_report(part) -> bool:
         return isinstance(part, dict) and isinstance(part.get("scenes"), dict) and bool(part.get("methods"))
@@ -72,22 +76,23 @@ def _reports(content: dict) -> Iterator[tuple[str, dict]]:
 
 
 def check_same(steps: dict, names: Iterable[str], other: dict, where: str | Path) -> None:
-    """Raises InputError where the report ``other`` is of other steps or scenes than those.
+    """Raises InputError if the report ``other`` has different steps or scenes.
 
     Args:
-        steps: n_encoded_steps, n_future_steps.
-        names: of the scenes.
-        where: the other report is from.
+        steps: n_encoded_steps and n_future_steps.
+        names: names of the scenes.
+        other: the other report.
+        where: file of the other report, for messages.
     """
     for key, what in SAME.items():
         if steps.get(key) != other.get(key):
             raise InputError(
-                f"{where}: {other.get(key)} {what}, here {steps.get(key)}; compare the same steps (--steps, --given)"
+                f"{where}: {other.get(key)} {what}, here {steps.get(key)}; compare equal steps (--steps, --given)"
             )
     known = set(names)
     if differing := sorted(known ^ set(other.get("scenes", ()))):
-        missing = "not scored there" if differing[0] in known else "scored there alone"
-        raise InputError(f"{where}: other scenes: {differing[0]} is {missing} ({len(differing)} scenes differ)")
+        missing = "not scored there" if differing[0] in known else "scored only there"
+        raise InputError(f"{where}: different scenes: {differing[0]} is {missing} ({len(differing)} scenes differ)")
 
 
 def _compare(ours: dict, other: dict, where: str) -> dict:
@@ -96,9 +101,9 @@ def _compare(ours: dict, other: dict, where: str) -> dict:
     for scene, scores in known.items():
         digests = [found.get("digest") if isinstance(found, dict) else None for found in (scores, its[scene])]
         if None in digests:
-            raise InputError(f"{where}: nothing says which images of {scene} were scored; evaluate again")
+            raise InputError(f"{where}: has no digest of the scored images of {scene}; run gsim3d evaluate again")
         if digests[0] != digests[1]:
-            raise InputError(f"{where}: {scene} has other images, labels or target cameras there than here")
+            raise InputError(f"{where}: images, labels or target cameras of {scene} differ between the reports")
     found = {}
     for score in (f"{part}.{metric}" for part in PARTS for metric in METRICS):
         pairs = [
@@ -113,14 +118,14 @@ def _compare(ours: dict, other: dict, where: str) -> dict:
 
 
 def _score(report: dict, scene: str, score: str) -> float | None:
-    """Of the first method; None where it has none."""
+    """Returns a score of the first method; None if it has no value."""
     method = report["methods"][0]
     value = report["scenes"][scene].get(score if method == "model" else f"{method}.{score}")
     return float(value) if isinstance(value, Real) and math.isfinite(value) else None
 
 
 def paired(differences: Sequence[float]) -> tuple[float, float | None]:
-    """The mean of differences of pairs, and its standard error; None of a single pair."""
+    """Returns the mean of paired differences, and its standard error (None for a single pair)."""
     n = len(differences)
     return statistics.fmean(differences), statistics.stdev(differences) / math.sqrt(n) if n > 1 else None
 
@@ -128,9 +133,9 @@ def paired(differences: Sequence[float]) -> tuple[float, float | None]:
 def _difference(differences: list[float], rises: bool) -> dict:
     mean, error = paired(differences)
     if error is None:
-        verdict = "of one scene: no standard error"
+        verdict = "single scene: no standard error"
     elif abs(mean) > LEAST * error:
         verdict = "better" if (mean > 0) == rises else "worse"
     else:
-        verdict = "the same within two standard errors"
+        verdict = "equal within two standard errors"
     return {"difference": mean, "standard_error": error, "scenes": len(differences), "verdict": verdict}

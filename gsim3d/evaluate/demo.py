@@ -1,4 +1,4 @@
-"""What ``gsim3d demo`` does: makes multi-view video and predicts it, by a shipped simulator or one trained here."""
+"""Implementation of ``gsim3d demo``: generates multi-view video and predicts it with a shipped or new simulator."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ _phase = partial(PhaseConfig, batch=2, target_views=2, warm_up=0.1)
 
 @dataclass(frozen=True)
 class DemoConfig:
-    """What a demo makes and trains.
+    """Configuration of a demo.
 
     Attributes:
-        preset: of gsim3d.synth.
-        data: its options to change.
-        train: the training.
-        simulator: name of one that comes with gsim3d, which is used instead of a training; None: train.
+        preset: data preset of gsim3d.synth.
+        data: options that override those of the preset.
+        train: training configuration.
+        simulator: name of a shipped simulator to use; None trains a new one.
     """
 
     preset: str = "mini"
@@ -69,10 +69,10 @@ SHIPPED = DemoConfig(
 
 
 def run_demo(out: str | Path, config: DemoConfig | None = None, *, progress: bool = True) -> dict:
-    """Runs the demo in the folder ``out``, from where it was left; returns the content of metrics.json.
+    """Runs or resumes the demo in the folder ``out``; returns the content of metrics.json.
 
     Raises:
-        InputError: ``out`` is no folder or holds a run with other settings, or a package is missing.
+        InputError: ``out`` is not a folder or contains a run with other settings, or a package is missing.
     """
     config = config or DemoConfig()
     out = Path(out)
@@ -88,19 +88,19 @@ def _run(out: Path, config: DemoConfig, progress: bool, start: float) -> dict:
     seconds = _Stopwatch(out / "seconds.json")
     pictures.pyplot()  # raises early without matplotlib
     place = "data" if config.simulator is None else "held_out"
-    print("multi-view video of bodies that fall", flush=True)
+    print("generating multi-view video of falling bodies", flush=True)
     with seconds.measure("data"):
         folders = generate(out / place, preset=config.preset, progress=progress, **config.data).folders
     if config.simulator is None:
         train_folders, folders = split_scenes(folders)
-        print(f"training on {len(train_folders)} scenes; {len(folders)} are held out", flush=True)
+        print(f"training on {len(train_folders)} scenes; {len(folders)} held out", flush=True)
         _train(out, config.train, train_folders, progress, seconds)
     print("predicting the held-out scenes", flush=True)
     with seconds.measure("evaluation"):
         predictor = _Predictor(config.simulator or out / "model")
         scenes = [predictor.restored.open_scene(folder) for folder in folders]
         summary = _evaluate(out, predictor, scenes, progress)
-    print("pictures", flush=True)
+    print("writing pictures", flush=True)
     with seconds.measure("pictures"):
         _pictures(out, predictor, scenes, summary)
     _report(out, summary, seconds.total, time.perf_counter() - start)
@@ -108,7 +108,7 @@ def _run(out: Path, config: DemoConfig, progress: bool, start: float) -> dict:
 
 
 class _Stopwatch:
-    """Seconds spent in each part, summed over all runs and kept in a file."""
+    """Seconds spent in each section, accumulated over resumed runs in a file."""
 
     def __init__(self, file: Path):
         self.file = file
@@ -128,10 +128,10 @@ class _Stopwatch:
 
 
 def _train(out: Path, config: TrainConfig, folders: list[Path], progress: bool, seconds: _Stopwatch) -> None:
-    """Trains to the end and exports."""
+    """Trains all steps and exports the model."""
     trainer = Trainer(config, [Scene.open(folder) for folder in folders], out / "model")
     if 0 < trainer.step < config.n_steps:
-        print(f"    going on from step {trainer.step}", flush=True)
+        print(f"    resuming at step {trainer.step}", flush=True)
     if trainer.step < config.n_steps:
         with seconds.measure("training"):
             trainer.run(progress=progress)
@@ -140,7 +140,7 @@ def _train(out: Path, config: TrainConfig, folders: list[Path], progress: bool, 
 
 
 class _Predictor:
-    """Predicts each scene to its end, once."""
+    """Predicts scenes to their last step, and caches the predictions."""
 
     def __init__(self, simulator: str | Path):
         self.restored, self._known = restore(simulator), {}
@@ -154,7 +154,7 @@ class _Predictor:
 
 
 def _evaluate(out: Path, predictor: _Predictor, scenes: list, progress: bool) -> dict:
-    """The scores of ``scenes``, from metrics.json where it has those of this checkpoint."""
+    """Returns the scores of ``scenes``, read from metrics.json if it is up to date with the checkpoint."""
     digest, file = predictor.restored.checkpoint.digest, out / "metrics.json"
     try:
         summary = json.loads(file.read_text())
@@ -169,7 +169,7 @@ def _evaluate(out: Path, predictor: _Predictor, scenes: list, progress: bool) ->
 
 
 def _pictures(out: Path, predictor: _Predictor, scenes: list, summary: dict) -> None:
-    """Writes all pictures, if one is missing or older than the numbers."""
+    """Writes all pictures if one is missing or older than metrics.json."""
     restored = predictor.restored
     made = [out / name for name in ("rollout.mp4", "psnr.png", "overview.png")]
     age = (out / "metrics.json").stat().st_mtime
@@ -193,7 +193,7 @@ def _pictures(out: Path, predictor: _Predictor, scenes: list, summary: dict) -> 
 
 
 def comparisons(summary: dict) -> list[tuple[str, float, float]]:
-    """(what, model, baseline) of the three comparisons that the demo stands for; PSNR in dB."""
+    """Returns (description, model, baseline) of three comparisons with baselines; PSNR in dB."""
     return [
         ("PSNR of predicted steps, against constant", summary["future.psnr"], summary["constant.future.psnr"]),
         ("the same, masked", summary["future.psnr_masked"], summary["constant.future.psnr_masked"]),
@@ -214,12 +214,12 @@ def _report(out: Path, summary: dict, seconds: dict, now: float) -> None:
         margin = f"{verdict} by {abs(model - baseline):.2f} dB"
         print(f"{what + ':':52}{model:7.2f} dB, baseline {baseline:.2f} dB: {margin}")
     parts = ", ".join(f"{name} {value:.0f}" for name, value in seconds.items())
-    in_all = f"{sum(seconds.values()):.0f} in all, {now:.0f} in this call"
+    in_all = f"{sum(seconds.values()):.0f} in total, {now:.0f} in this run"
     print(f"\nseconds: {parts}; {in_all}; peak memory {_peak_gib():.1f} GiB")
-    print(f"look at {out / 'rollout.mp4'} and {out / 'overview.png'}")
+    print(f"open {out / 'rollout.mp4'} and {out / 'overview.png'}")
 
 
 def _peak_gib() -> float:
-    """Peak memory of this process and of the largest of its children, GiB."""
+    """Returns the peak memory of this process plus its largest child, in GiB."""
     unit = 2**30 if sys.platform == "darwin" else 2**20
     return sum(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / unit

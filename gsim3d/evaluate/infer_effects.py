@@ -1,4 +1,4 @@
-"""The smallest spec under which a model predicts a scene as well as under its own (``gsim3d effects infer``)."""
+"""Search for the cheapest EffectsSpec without loss of quality on a scene (``gsim3d effects infer``)."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from gsim3d.io.terminal import in_columns
 from gsim3d.presets import ModelConfig
 from gsim3d.train.restore import Restored
 
-WINDOWS, STEPS = 3, 4  # windows spread over the video, and steps predicted and compared in each
-ROUNDS = 3  # of which the fastest counts
+WINDOWS, STEPS = 3, 4  # windows over the video, and predicted steps in each
+ROUNDS = 3  # timed repetitions; the fastest counts
 
 Settings = dict[str, list[tuple[str, EffectsSpec]]]  # effect -> (setting, spec with it)
 Measured = tuple[float, float]  # PSNR in dB, seconds per step
@@ -28,15 +28,15 @@ Measured = tuple[float, float]  # PSNR in dB, seconds per step
 
 @dataclass(frozen=True)
 class Proposal:
-    """What :func:`infer` found.
+    """Result of :func:`infer`.
 
     Attributes:
         spec: the smallest spec within the tolerance.
-        measured: PSNR in dB and seconds per step under ``spec``.
-        before: the same under the checkpoint's spec.
-        constant_psnr: dB, of the last encoded particles in place of predicted ones.
-        n_cameras: cameras whose images are compared.
-        table: (effect, setting, worth in dB, cost in ms, note) of every setting.
+        measured: PSNR in dB and seconds per step with ``spec``.
+        before: PSNR in dB and seconds per step with the checkpoint's spec.
+        constant_psnr: PSNR in dB of the constant baseline, the last encoded particles.
+        n_cameras: number of target cameras.
+        table: (effect, setting, gain in dB, cost in ms, note) of every setting.
     """
 
     spec: EffectsSpec
@@ -50,17 +50,23 @@ class Proposal:
         (psnr, seconds), (now, faster) = self.before, self.measured
         table = in_columns([("effect", "setting", "worth dB", "costs ms", ""), *self.table])
         return (
-            f"{psnr:.2f} dB with what the checkpoint has on, {self.constant_psnr:.2f} dB with particles held still; "
-            f"{1e3 * seconds:.1f} ms a step with images of {self.n_cameras} cameras\n\n{table}\n\n"
+            f"{psnr:.2f} dB with the checkpoint's effects, {self.constant_psnr:.2f} dB with constant particles; "
+            f"{1e3 * seconds:.1f} ms per step with images of {self.n_cameras} cameras\n\n{table}\n\n"
             f"proposed: {now:.2f} dB ({now - psnr:+.3f}), {seconds / faster:.2f} times as fast"
         )
 
 
 def infer(restored: Restored, scene: Scene, tolerance: float, progress: Callable) -> Proposal:
-    """The smallest spec that loses at most ``tolerance`` dB on ``scene``, and all measurements.
+    """Finds the smallest spec that loses at most ``tolerance`` dB on ``scene``.
 
     Args:
-        progress: number of settings -> context manager of a progress bar.
+        restored: the model.
+        scene: scene to predict and compare with.
+        tolerance: largest loss of PSNR in dB.
+        progress: function number of settings -> context manager of a progress bar.
+
+    Returns:
+        The spec and all measurements.
     """
     base = restored.plan.spec
     settings = smaller_settings(base, restored.simulator.config)
@@ -72,7 +78,7 @@ def infer(restored: Restored, scene: Scene, tolerance: float, progress: Callable
 
 
 def smaller_settings(base: EffectsSpec, model: ModelConfig) -> Settings:
-    """Every setting below that of ``base``, the smallest first."""
+    """Returns every setting smaller than that of ``base``, per effect, in ascending order."""
     plan, dynamics, appearance = make_plan(base, model), base.dynamics, base.appearance
     history = [2**bits for bits in range(model.dynamics.history_bits + 1) if 2**bits < plan.history]
     changing = {"all": ("none", "dynamic"), "none": ()}.get(appearance.changing, ("none",))
@@ -95,12 +101,20 @@ def smaller_settings(base: EffectsSpec, model: ModelConfig) -> Settings:
 def propose(
     base: EffectsSpec, settings: Settings, trial: Callable[[EffectsSpec], Measured], before: Measured, tolerance: float
 ) -> tuple[list[tuple[str, ...]], EffectsSpec, Measured]:
-    """A table of all settings, the smallest spec that loses at most ``tolerance`` dB and takes no longer, and its
-    measurement; ``base`` if no smaller one is as good and as fast.
+    """Chooses for each effect the smallest setting that is as good and as fast as ``base``, then combines them.
+
+    While the combination loses more than ``tolerance`` dB or is slower than ``base``, the effect with the largest loss
+    or the smallest speed-up is restored.
 
     Args:
+        base: the spec to reduce.
+        settings: smaller settings of each effect, see :func:`smaller_settings`.
         trial: measures a spec.
-        before: the measurement of ``base``.
+        before: measurement of ``base``.
+        tolerance: largest loss of PSNR in dB.
+
+    Returns:
+        Table of all settings, the chosen spec, and its measurement.
     """
     psnr, seconds = before
     table, chosen, lost, saved, put_back = [], {}, {}, {}, {}
@@ -130,7 +144,7 @@ def propose(
 
 
 def combined(base: EffectsSpec, specs: Iterable[EffectsSpec]) -> EffectsSpec:
-    """``base`` with every setting in which one of ``specs`` differs from it."""
+    """Returns ``base`` with all settings in which one of ``specs`` differs from it."""
     spec = base
     for other in specs:
         for group in (field.name for field in fields(base)):
@@ -142,10 +156,12 @@ def combined(base: EffectsSpec, specs: Iterable[EffectsSpec]) -> EffectsSpec:
 
 
 class Trial:
-    """Measures specs: PSNR of short predictions against the video, and seconds of a step and its images.
+    """Measures specs: PSNR of short predictions, and seconds per step including its images.
 
     Args:
-        bar: progress bar that each measurement advances.
+        restored: the model.
+        scene: scene to predict and compare with.
+        bar: progress bar, advanced by each measurement.
     """
 
     def __init__(self, restored: Restored, scene: Scene, bar):
@@ -166,12 +182,12 @@ class Trial:
             start = time.perf_counter()
             psnr = self._psnr(restored, lambda state: predict(state, n_steps, restored.plan).steps)
             times.append(time.perf_counter() - start)
-        self.bar.total = max(self.bar.total, self.bar.n + 1)  # combinations of settings may be tried several times
+        self.bar.total = max(self.bar.total, self.bar.n + 1)  # the number of combinations is not known in advance
         self.bar.update()
         return psnr, min(times) / self.n_steps / len(self.videos)
 
     def constant_psnr(self) -> float:
-        """PSNR in dB of the last encoded particles in place of predicted ones."""
+        """Returns the PSNR in dB of the constant baseline, the last encoded particles."""
 
         def constant(state):
             newest = last_steps(state, 1)
@@ -180,7 +196,7 @@ class Trial:
         return self._psnr(self.restored, constant)
 
     def _psnr(self, restored: Restored, predict: Callable) -> float:
-        """PSNR of ``predict`` (state -> the next steps); waits for the device."""
+        """Returns the PSNR in dB of ``predict`` (state -> next steps); synchronises the device."""
         errors = []
         for state, video, first in zip(self.states, self.videos, self.first, strict=True):
             images = render_steps(restored, concatenate(predict(state)), self.scene, self.cams, first)

@@ -1,4 +1,4 @@
-"""What ``gsim3d evaluate`` does: scores a checkpoint and predictions of other models, and writes the report."""
+"""Implementation of ``gsim3d evaluate``: scores a checkpoint and predictions of other models, and writes a report."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from gsim3d.synth.held_out import set_of
 from gsim3d.train.processes import Processes, joined
 from gsim3d.train.restore import Restored, restore
 
-Views = list[tuple[Sequence[int] | None, Sequence[int]]]  # (input cameras, compared cameras) of each scene
+Views = list[tuple[Sequence[int] | None, Sequence[int]]]  # (input cameras, target cameras) of each scene
 
 
 @dataclass(frozen=True)
@@ -29,20 +29,20 @@ class Job:
 
     Attributes:
         data: folder with scenes, or a report to compare.
-        checkpoint: as of :func:`gsim3d.train.restore.restore`; None: only ``predictions`` are scored.
+        checkpoint: see :func:`gsim3d.train.restore.restore`; None scores only ``predictions``.
         predictions: "[NAME=]DIR" of other models.
-        given: steps that the other models were given, without a checkpoint.
-        scenes: "test", "train" or "all"; None: "test", and "all" of held-out sets.
+        given: number of input steps of the other models, if there is no checkpoint.
+        scenes: "test", "train" or "all"; None means "all" for held-out data sets, else "test".
         split: "gsim3d" or "published", the rule that holds scenes out.
-        steps: steps to predict; None: to the end of the shortest video.
-        cameras: cameras to compare; None: those kept from the training's inputs.
-        context: input cameras; None: spread evenly.
-        metrics: what to measure; None: all whose weights are installed.
-        clips: clips of which FVD is measured, at most.
-        keep, resample: as of :meth:`gsim3d.train.restore.Restored.open_scene`.
+        steps: number of steps to predict; None predicts to the end of the shortest video.
+        cameras: target cameras; None uses those excluded from the training's inputs.
+        context: input cameras; None spaces them evenly.
+        metrics: metrics to measure; None measures all whose weights are installed.
+        clips: largest number of clips for FVD.
+        keep, resample: see :meth:`gsim3d.train.restore.Restored.open_scene`.
         against: report of another model to compare with.
         device: "cpu" or "cuda".
-        out: JSON file; None: metrics.json beside what is scored.
+        out: JSON file; None writes metrics.json next to the checkpoint or predictions.
     """
 
     data: str
@@ -67,7 +67,7 @@ def evaluate(job: Job) -> None:
     """Runs ``job``; prints tables and writes the report.
 
     Raises:
-        InputError: options contradict each other, or the data do not fit the models.
+        InputError: options contradict each other, or the data do not fit the model.
     """
     other = None if job.against is None else compare.read_report(job.against)
     if other is not None and job.checkpoint is None and not job.predictions:
@@ -76,23 +76,23 @@ def evaluate(job: Job) -> None:
         return
     metrics, not_measured = measurable(job.metrics)
     if job.checkpoint is None and not job.predictions:
-        raise InputError("nothing to evaluate: name a CHECKPOINT, or predictions of other models with --predictions")
+        raise InputError("nothing to evaluate: give a CHECKPOINT, or predictions of other models with --predictions")
     if job.checkpoint is None and (job.given is None or job.given < 1):
-        raise InputError("--given: without a CHECKPOINT, say how many steps the other models were given, at least 1")
+        raise InputError("--given: the number of input steps (at least 1) is required without a CHECKPOINT")
     if job.checkpoint is not None and job.given is not None:
-        raise InputError("--given: with a CHECKPOINT it is the model's own history; leave the option out")
+        raise InputError("--given: cannot be combined with a CHECKPOINT, whose history sets the input steps")
     if job.checkpoint is None and (job.resample or job.keep):
-        raise InputError("--resample and --keep fit scenes to a CHECKPOINT; without one leave them out")
+        raise InputError("--resample and --keep require a CHECKPOINT")
     with joined(job.device) as processes:
         _evaluate(job, metrics, not_measured, other, processes)
 
 
 def _evaluate(job: Job, metrics: tuple, not_measured: dict, against: dict | None, processes: Processes) -> None:
-    """Scores this process's share of the scenes; the first process gathers and writes."""
+    """Scores this process's share of the scenes; the first process writes the report."""
     restored = None if job.checkpoint is None else restore(job.checkpoint, job.device)
     others = [Predictions.open(given, job.data) for given in job.predictions]
     if len({other.name for other in others}) != len(others):
-        raise InputError("--predictions: two have the same name; write NAME=DIR")
+        raise InputError("--predictions: names must be unique; use NAME=DIR")
     out = _report_path(job, others)
     n_encoded = job.given if restored is None else restored.data.history
     scenes, conditions = _open_scenes(job, restored)
@@ -129,7 +129,7 @@ def _evaluate(job: Job, metrics: tuple, not_measured: dict, against: dict | None
             comparison = compare.compare(summary, against, job.against)
             summary["against"] = {"file": job.against, "checkpoint": against.get("checkpoint"), **comparison[""]}
             print(f"\n{compare.table(comparison, job.against)}")
-        except InputError as error:  # raised once the scores are written
+        except InputError as error:  # raised after the scores are written
             refused = error
     files = _write(out, job.data, scores, summary)
     print("\nwritten: " + ", ".join(str(path) for path in files))
@@ -141,13 +141,13 @@ def _report_path(job: Job, others: list[Predictions]) -> Path:
     if job.out:
         return output_path(job.out, ".json")
     place = folder_of(job.checkpoint) if job.checkpoint else Path(others[0].folder)
-    if place.is_relative_to(FOLDER):  # nothing is written into the package
+    if place.is_relative_to(FOLDER):  # the installed package is not written to
         return Path("metrics.json")
     return place / "metrics.json"
 
 
 def _open_scenes(job: Job, restored: Restored | None) -> tuple[list[Scene], dict]:
-    """The chosen scenes as the model expects them, and which part of which set they are."""
+    """Opens the chosen scenes, fitted to the model; also returns the data set and split they belong to."""
     folders = find_scenes(job.data)
     found = set_of(folders)
     part = job.scenes or ("all" if found and found["name"] else "test")
@@ -163,7 +163,7 @@ def _open_scenes(job: Job, restored: Restored | None) -> tuple[list[Scene], dict
 def _views(
     job: Job, restored: Restored | None, others: list[Predictions], scenes: list[Scene], n_encoded: int
 ) -> tuple[Views, int]:
-    """Cameras of each scene, and how many steps are predicted of all."""
+    """Returns the cameras of each scene, and the number of steps to predict."""
     views, n_future = [], job.steps
     for scene in scenes:
         context, targets = None, job.cameras
@@ -178,13 +178,13 @@ def _views(
 
 
 def _name(scene: Scene, root: str) -> str:
-    """The scene's folder below the data set's, which no two scenes share."""
+    """Returns a unique name of a scene: its folder relative to the data set."""
     below = scene.path.relative_to(root).as_posix()
     return scene.name if below == "." else below
 
 
 def _write(out: Path, data: str, scores: list[SceneScores], summary: dict) -> list[Path]:
-    """Writes the report in all its forms; returns the files."""
+    """Writes the report as JSON, CSV, markdown and PNG; returns the files."""
     with_parents(out)
     files = [out, out.with_suffix(".csv"), out.with_suffix(".md")]
     write_json(files[0], summary)

@@ -1,6 +1,6 @@
-"""Image metrics, one value an image; computed in float64.
+"""Image metrics, one value per image, computed in float64.
 
-Images are floating with colours in [0, 1], or uint8, which is divided by 255; other dtypes and ranges are refused.
+Images are floating point in [0, 1], or uint8, which is divided by 255; other dtypes and ranges are an error.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from torch import Tensor
 from gsim3d.errors import InputError
 from gsim3d.evaluate.perceptual.colors import as_colors
 
-PSNR_CAP = 100.0  # dB, given to images whose mean squared error is below 1e-10, perfect ones included
+PSNR_CAP = 100.0  # dB, largest value; reached at a mean squared error of 1e-10
 
 SSIM_WINDOW = 11  # pixels
 
@@ -21,16 +21,18 @@ _SSIM_K1, _SSIM_K2 = 0.01, 0.03
 
 
 def psnr(pred: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Peak signal-to-noise ratio of each image, over all pixels or over a mask.
+    """Computes the peak signal-to-noise ratio of each image, over all pixels or over a mask.
 
-    ``-10 log10 max(1e-10, mean of squared errors over counted pixels and channels)``; so never above 100 dB, never
-    infinite. An image with an empty mask has no such value: it is NaN, and :func:`mean_of_counted` leaves it out.
+    ``-10 log10 max(1e-10, mse)``, with the mean squared error over masked pixels and channels; at most 100 dB. NaN for
+    an image with an empty mask, which :func:`mean_of_counted` ignores.
 
     Args:
         pred, target: [I, H, W, C].
-        mask: bool [I, H, W]; None: all pixels.
+        mask: bool [I, H, W]. Default: all pixels.
+
     Returns:
         float64 [I], dB.
+
     Raises:
         InputError: shapes differ, or images are not in [0, 1].
     """
@@ -42,16 +44,19 @@ def psnr(pred: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
 
 
 def ssim(pred: Tensor, target: Tensor) -> Tensor:
-    """Structural similarity of each image: Gaussian window of 11 pixels (sigma 1.5), sample covariance, range 1.
+    """Computes the structural similarity of each image: Gaussian window of 11 pixels, sigma 1.5, sample covariance.
 
-    The mean over channels and over the pixels whose whole window lies inside the image.
+    Averaged over channels and over the pixels whose window lies inside the image.
 
     Args:
         pred, target: [I, H, W, C], H and W at least 11.
+
     Returns:
         float64 [I] in [-1, 1].
+
     Raises:
         InputError: shapes differ, or images are not in [0, 1] or too small.
+
     Source:
         Wang et al. 2004, "Image quality assessment: from error visibility to structural similarity".
     """
@@ -79,13 +84,13 @@ def ssim(pred: Tensor, target: Tensor) -> Tensor:
 
 
 def mean_of_counted(values: Tensor) -> float | None:
-    """The mean of the values that exist (are not NaN); None where there is none."""
+    """Returns the mean of the values that are not NaN; None if all are NaN."""
     counted = values[~values.isnan()]
     return float(counted.mean()) if len(counted) else None
 
 
 def _checked(pred: Tensor, target: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Both in float64."""
+    """Validates both images and converts them to float64."""
     pred, target = as_colors(pred, "pred"), as_colors(target, "target")
     if pred.ndim != 4 or pred.shape != target.shape or 0 in pred.shape[1:]:
         raise InputError(f"images must both be [I, H, W, C]; got {tuple(pred.shape)} and {tuple(target.shape)}")

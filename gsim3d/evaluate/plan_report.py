@@ -1,10 +1,12 @@
-"""What a plan computes of a scene, and what that costs (``gsim3d plan``)."""
+"""Report of a plan: active priors, switches and outputs, and predicted costs (``gsim3d plan``)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+
+import torch
 
 from gsim3d.data import Scene, make_frames
 from gsim3d.effects.plan import Plan, Workload, background_cost, predicted_cost
@@ -19,16 +21,16 @@ from gsim3d.train.config import DataConfig
 from gsim3d.train.restore import Restored
 from gsim3d.train.samples import context_cameras, spread_views, subsampled
 
-TIMES = "measured"  # the key of times in a file of speeds, beside the presets of a device
+TIMES = "measured"  # key of measured times in a speeds file, next to the presets of a device
 
 
 @dataclass(frozen=True)
 class PartTimes:
-    """What the parts of a reference's step took: all that the checkpoint's spec asks for, launched kernel by kernel.
+    """Measured times of the parts of a reference step: the checkpoint's spec, without CUDA graphs.
 
     Attributes:
-        on: the machine.
-        work: a step of the scenes that it was measured on, and its images.
+        on: name of the machine.
+        work: workload at which the times were measured.
         dynamics, gaussians, images: milliseconds of the parts of :func:`gsim3d.effects.plan.predicted_cost`.
         host: milliseconds in which a GPU waits for the host.
     """
@@ -45,13 +47,13 @@ class PartTimes:
             raise InputError(f"work must hold counts; got {asdict(self.work)}")
 
     def predicted(self, own: Plan, plan: Plan, model: ModelConfig, work: Workload) -> dict[str, float]:
-        """Milliseconds of each part under ``plan``: as many times those measured as the multiply-adds are more.
+        """Predicts the milliseconds of each part under ``plan``, scaling measured times by multiply-adds.
 
         Args:
-            own: the plan of the checkpoint, under which the times were measured.
-            plan: to predict.
-            model: of both.
-            work: what ``plan`` is applied to.
+            own: plan of the checkpoint, with which the times were measured.
+            plan: plan to predict.
+            model: configuration of the model.
+            work: workload to predict.
         """
         before, after = predicted_cost(own, model, self.work), predicted_cost(plan, model, work)
         scaled = {part: getattr(self, part) * after[part] / max(before[part], 1.0) for part in after}
@@ -59,32 +61,34 @@ class PartTimes:
 
 
 def load_times(folder: Path, restored: Restored) -> dict[str, PartTimes]:
-    """Kind of device -> what the reference of a checkpoint took where it was measured; empty where it was not."""
+    """Reads device -> measured times of a checkpoint's reference step; empty if it was not profiled."""
     devices, where = read_speeds(folder).get(restored.checkpoint.digest) or {}, folder / SPEEDS_FILE
     known = {name: kept[TIMES] for name, kept in devices.items() if isinstance(kept, dict) and TIMES in kept}
     return {name: from_dict(PartTimes, values, f"{where}: {name}: {TIMES}: ") for name, values in known.items()}
 
 
 def workload(scene: Scene, data: DataConfig) -> Workload:
-    """Particles of the first step of ``scene`` as a model trained on ``data`` sees it, and one image."""
+    """Counts the particles of the first step of ``scene`` for a model trained on ``data``, and one image."""
     cameras = context_cameras(scene, data)
     views = spread_views(cameras, min(data.context_views, len(cameras)), 0)
     frames = subsampled(make_frames([scene], [list(views)], [range(1)]), data)
-    moving = kept = frames.images.shape[0] * scene.height * scene.width
-    if frames.masks is not None:
-        moving = kept = int(frames.masks.sum())
-    if frames.dynamic is not None:
-        moving = int((frames.dynamic if frames.masks is None else frames.dynamic & frames.masks).sum())
-    return Workload(moving, kept - moving, 1, scene.height * scene.width)
+    masks = torch.ones_like(frames.images[:, 0], dtype=torch.bool) if frames.masks is None else frames.masks
+    moving = masks if frames.dynamic is None else masks & frames.dynamic
+    n_moving = int(moving.sum())
+    return Workload(n_moving, int(masks.sum()) - n_moving, 1, scene.height * scene.width)
 
 
 def plan_report(
     simulator: Simulator, plan: Plan, work: Workload, times: dict[str, PartTimes], own: Plan
 ) -> Iterator[str]:
-    """Paragraphs: priors, switches and outputs that are on, unused parameters, and the predicted costs of a step.
+    """Yields the paragraphs of the report: active parts, unused parameters, and predicted costs of a step.
 
     Args:
-        times: device -> times of parts of a step that were measured there under the plan ``own``.
+        simulator: the model.
+        plan: plan to report.
+        work: workload of a step.
+        times: device -> times measured with the plan ``own``.
+        own: plan of the checkpoint.
     """
     switches = [(name, "switch", setting) for name, setting in plan.switches]
     priors = [(name, "prior", f"number {n} of {len(plan.priors)}") for n, name in enumerate(plan.priors, 1)]
@@ -99,17 +103,17 @@ def plan_report(
     once = background_cost(plan, simulator.config, work)
     yield "\n".join(
         ["predicted multiply-adds of one step and one image, in millions", _compared(*costs)]
-        + [f"and of the background, once a rollout: {once / 1e6:.1f}"] * (once > 0)
+        + [f"background, once per rollout: {once / 1e6:.1f}"] * (once > 0)
     )
     for device, measured in times.items():
         costs = [measured.predicted(own, p, simulator.config, work) for p in (plan, largest)]
-        head = f"predicted milliseconds on {device}, from those that gsim3d profile measured ({measured.on})"
+        head = f"predicted milliseconds on {device}, scaled from gsim3d profile's measurement ({measured.on})"
         yield f"{head}\n{_compared(*costs)}"
 
 
 def _compared(costs: dict[str, float], largest: dict[str, float]) -> str:
-    """A table of the costs of the parts of a step under a plan and under the largest one."""
+    """Formats the costs of the parts of a step, for a plan and for the largest plan of the model."""
     parts = [(part, costs[part], largest[part]) for part in largest]
     parts.append(("all", sum(costs.values()), sum(largest.values())))
     rows = [(part, f"{one:.1f}", f"{most:.1f}", f"{one / max(most, 1e-6):.2f}") for part, one, most in parts]
-    return in_columns([("part", "this plan", "all that the model can", "share"), *rows])
+    return in_columns([("part", "this plan", "largest plan", "share"), *rows])

@@ -1,10 +1,10 @@
-"""Predictions of other models: a folder of videos or frames, laid out as the data set is.
+"""Predictions of other models, read from a folder that mirrors the data set.
 
-    DIR/<scene folder, as below DATA>/cam_<j>/<frames>.png      each name ends in the number of its step
-    DIR/<scene folder, as below DATA>/cam_<j>.mp4               or one video a camera
+    DIR/<scene folder relative to DATA>/cam_<j>/<frames>.png      each name ends in the index of its step
+    DIR/<scene folder relative to DATA>/cam_<j>.mp4               or one video per camera
 
-Steps count from 0, the first frame of the scene. Frames of steps that were given may be there; they are not read. A
-video holds all steps up to the last one compared or to the end of the scene, or only those after the given ones.
+Steps count from 0, the first frame of the scene. Frames of input steps are optional and ignored. A video starts at step
+0 or at the first predicted step, and ends at the last compared step or at the end of the scene.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class Predictions:
     """Predicted images of one model for the scenes of a data set.
 
     Attributes:
-        name: in tables and reports.
-        folder: where they lie.
+        name: name in tables and reports.
+        folder: folder of the predictions.
         root: folder of the data set.
     """
 
@@ -41,10 +41,10 @@ class Predictions:
 
     @staticmethod
     def open(given: str, root: str | Path) -> Predictions:
-        """From ``NAME=DIR``, or ``DIR``, whose last part is then the name.
+        """Opens ``NAME=DIR``, or ``DIR``, whose last component is then the name.
 
         Raises:
-            InputError: the folder does not exist, or the name is taken by a baseline.
+            InputError: the folder does not exist, or the name is that of a baseline.
         """
         name, _, folder = given.rpartition("=") if re.match(r"[\w-]+=", given) else ("", "", given)
         folder = Path(folder)
@@ -52,30 +52,33 @@ class Predictions:
             raise InputError(f"--predictions: {folder} is not a folder")
         name = name or re.sub(r"[^\w-]", "_", folder.absolute().name)
         if name in RESERVED:
-            raise InputError(f"--predictions: the name {name!r} is taken; name them otherwise: OTHER={folder}")
+            raise InputError(f"--predictions: the name {name!r} is reserved; choose another: NAME={folder}")
         return Predictions(name, folder, Path(root))
 
     def cameras(self, scene: Scene) -> tuple[int, ...]:
-        """Cameras of which there are predictions for ``scene``. Raises InputError where there is none."""
+        """Returns the cameras with predictions for ``scene``. Raises InputError if there are none."""
         folder = self._scene_folder(scene)
         stems = {path.stem if path.suffix in VIDEOS else path.name for path in folder.iterdir()}
         cams = sorted(int(match[1]) for stem in stems if (match := re.fullmatch(r"cam_(\d+)", stem)))
         if not cams:
-            raise InputError(f"{folder}: holds neither a folder nor a video named cam_<number>")
+            raise InputError(f"{folder}: contains neither a folder nor a video named cam_<number>")
         if cams[-1] >= scene.n_cams:
             raise InputError(f"{folder}: predictions of camera {cams[-1]}, but {scene.path} has {scene.n_cams} cameras")
         return tuple(cams)
 
     def check(self, scene: Scene, cams: Sequence[int], n_encoded: int, n_future: int) -> None:
-        """Raises InputError where a folder, a frame or a video is missing; nothing is decoded."""
+        """Raises InputError if a folder, frame or video is missing; decodes nothing."""
         for cam in cams:
             _find(self._scene_folder(scene) / f"cam_{cam}", range(n_encoded, n_encoded + n_future))
 
     def images(self, scene: Scene, cams: list[int], n_encoded: int, n_future: int) -> Tensor:
-        """uint8 [n_future, V, H, W, 3]: the steps after the first ``n_encoded``, as cameras ``cams`` see them.
+        """Reads the predicted images of ``cams`` at the ``n_future`` steps after the first ``n_encoded``.
+
+        Returns:
+            uint8 [n_future, V, H, W, 3].
 
         Raises:
-            InputError: a folder, frame or video is missing, too short, broken or of another size.
+            InputError: a folder, frame or video is missing, too short, damaged or of another size.
         """
         folder = self._scene_folder(scene)
 
@@ -98,7 +101,7 @@ class Predictions:
 def _view(
     path: Path, size: tuple[int, int], n_steps: int, n_encoded: int, n_future: int, problems: Problems
 ) -> list[np.ndarray]:
-    """One camera's predicted frames [h, w, 3], RGB."""
+    """Returns one camera's predicted RGB frames, [h, w, 3] each."""
     steps = range(n_encoded, n_encoded + n_future)
     found = _find(path, steps)
     if isinstance(found, Path):
@@ -106,12 +109,12 @@ def _view(
     named = ((file, f"predicted step {step}") for file, step in zip(found, steps, strict=True))
     frames = list(read_files(named, size, as_color, problems))
     if max(int(frame.max()) for frame in frames) == 1:
-        raise InputError(f"{path}: colours are 0 and 1 of 255, as in images in [0, 1] that were saved unscaled")
+        raise InputError(f"{path}: colours are 0 and 1 of 255: were images in [0, 1] saved without scaling by 255?")
     return frames
 
 
 def _find(path: Path, steps: range) -> Path | list[Path]:
-    """The video, or the frames of ``steps``."""
+    """Returns the video file, or the frame files of ``steps``."""
     if path.is_dir():
         return _frames(path, steps)
     for suffix in VIDEOS:
@@ -131,8 +134,8 @@ def _frames(folder: Path, steps: range) -> list[Path]:
         files[step] = path
     if missing := [step for step in steps if step not in files]:
         raise InputError(
-            f"{folder}: step {missing[0]} is missing ({len(missing)} of {len(steps)} are); file names end in the "
-            f"number of their step, here {steps[0]} to {steps[-1]}"
+            f"{folder}: step {missing[0]} is missing ({len(missing)} of {len(steps)} are); file names must end in "
+            f"their step, here {steps[0]} to {steps[-1]}"
         )
     return [files[step] for step in steps]
 
@@ -142,15 +145,15 @@ def _from_video(file: Path, size: tuple[int, int], n_steps: int, n_encoded: int,
     video = Video(file, file.stem, size, problems)
     n_frames, last = len(video.numbers), n_encoded + n_future
     if video.rate is None and n_frames > 2:
-        raise InputError(f"{file}: {video.unevenness}; write its frames at an even rate, or as images")
+        raise InputError(f"{file}: {video.unevenness}; write it at a constant frame rate, or as image files")
     first = {n_steps: 0, n_steps - n_encoded: n_encoded, last: 0, n_future: n_encoded}
     if n_frames not in first:
         raise InputError(
             f"{file} has {'more than ' if n_frames > n_steps else ''}{min(n_frames, n_steps)} frames; to compare the "
-            f"{n_future} steps after the {n_encoded} given ones, it must have {last} (or the scene's {n_steps}), or "
-            f"without the given ones {n_future} (or {n_steps - n_encoded})"
+            f"{n_future} steps after the {n_encoded} input steps, it must have {last} (or the scene's {n_steps}), or "
+            f"without the input steps {n_future} (or {n_steps - n_encoded})"
         )
     if n_frames == n_steps - n_encoded == last:
-        raise InputError(f"{file} has {n_frames} frames: is the first one step 0 or {n_encoded}? Use frames instead")
+        raise InputError(f"{file} is ambiguous: its first frame may be step 0 or {n_encoded}; use image files instead")
     start = n_encoded - first[n_frames]
     return list(video.read(range(start, start + n_future), problems))

@@ -1,13 +1,13 @@
-"""Encode the first steps of a scene, predict all others, compare them with the truth and with cheap predictions.
+"""Evaluation protocol: encode the first steps of a scene, predict the rest, score against ground truth and baselines.
 
 Baselines:
 
-- ``constant``: the model's own last encoded particles, held still (what the dynamics adds);
-- ``copy``: the true last input frame of the same camera (no model at all);
-- ``constant_velocity``: the last encoded step; what may move goes on as far a step as its centroid went last;
-- ``release_constant``: the first predicted step, held still (the baseline of the published evaluation);
-- ``perfect_ground``, ``perfect_body``: ``constant`` with the true pixels of the ground, or of the bodies (masked PSNR
-  alone): what the other pixels cost.
+- ``constant``: the model's own last encoded particles; shows the gain of the dynamics;
+- ``copy``: the last true input frame of the same camera;
+- ``constant_velocity``: the last encoded particles; movable ones keep the velocity of their centroid;
+- ``release_constant``: the first predicted step; the baseline of the published evaluation;
+- ``perfect_ground``, ``perfect_body``: ``constant`` with true pixels of ground or bodies (masked PSNR only);
+  isolates the error of the other pixels.
 
 Predictions of other models (predictions.py) are scored on the same steps, views and scenes.
 """
@@ -41,9 +41,9 @@ from gsim3d.train.restore import Restored
 from gsim3d.train.samples import context_cameras, spread_views
 
 METHODS = ("model", "constant", "copy", "constant_velocity", "release_constant", *EXACT_PARTS)
-TOGETHER = 8  # scenes that a GPU predicts in one rollout, fewer where they are large
-MOST_PIXELS = 2**21  # of the input images of one rollout
-CLIPS = 48  # of which FVD is measured
+TOGETHER = 8  # largest number of scenes that a GPU predicts in one rollout
+MOST_PIXELS = 2**21  # largest number of input pixels in one rollout
+CLIPS = 48  # default number of clips for FVD
 
 
 @dataclass(frozen=True)
@@ -51,10 +51,10 @@ class Prediction:
     """Encoded and predicted particles of one scene.
 
     Attributes:
-        particles: one cloud a step, the first ``n_encoded`` of them encoded.
-        n_encoded: encoded steps.
-        context_cams: cameras whose images were the input.
-        resting: share of the predicted particles that rested and were not computed.
+        particles: one cloud per step; the first ``n_encoded`` are encoded, the others predicted.
+        n_encoded: number of encoded steps.
+        context_cams: input cameras.
+        resting: fraction of the predicted particles that were at rest and skipped.
     """
 
     particles: Particles
@@ -67,16 +67,26 @@ class Prediction:
         return self.particles.n_clouds
 
     def step(self, number: int) -> Particles:
-        """The particles of one step."""
+        """Returns the particles of one step."""
         return self.particles.select_clouds(torch.tensor([number], device=self.particles.means.device))
 
 
 def default_views(
     restored: Restored, scene: Scene, context: Sequence[int] | None = None, target: Sequence[int] | None = None
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """(context, target) cameras: those named, and for what is not named
+    """Chooses input and target cameras where they are not given.
 
-    inputs spread evenly, none of them a named target; targets those that training never had as inputs, else the rest.
+    Args:
+        restored: the model.
+        scene: the scene.
+        context: input cameras. Default: as many as in training, evenly spaced, without ``target``.
+        target: target cameras. Default: those that training excluded from inputs, else all that are not inputs.
+
+    Returns:
+        (context, target) cameras.
+
+    Raises:
+        InputError: too few cameras are left as inputs.
     """
     data = restored.data_of(scene)
     if not context:
@@ -84,14 +94,14 @@ def default_views(
         count = min(data.context_views, len(cameras))
         if count < min(2, restored.data.context_views):
             raise InputError(
-                f"{scene.path}: {len(cameras)} cameras left as inputs; training had {restored.data.context_views} "
-                "views (--context names inputs)"
+                f"{scene.path}: {len(cameras)} cameras left as inputs; training used {restored.data.context_views} "
+                "views (set inputs with --context)"
             )
         context = spread_views(cameras, count, 0)
         if count < restored.data.context_views:
             warnings.warn(
-                f"fitted to the model: {count} input views, cameras {' '.join(map(str, context))}; training had "
-                f"{restored.data.context_views} (--context names inputs)",
+                f"fitted to the model: {count} input views, cameras {' '.join(map(str, context))}; training used "
+                f"{restored.data.context_views} (set inputs with --context)",
                 FitWarning,
                 stacklevel=2,
             )
@@ -102,16 +112,16 @@ def default_views(
 
 
 def horizon(scene: Scene, n_encoded: int, n_future: int | None) -> int:
-    """Steps that can be predicted and compared: ``n_future``, or all that the scene has after ``n_encoded``.
+    """Returns the number of steps to predict: ``n_future``, or by default all steps after the first ``n_encoded``.
 
     Raises:
-        InputError: the scene is too short, or the number below 1.
+        InputError: the scene is too short, or ``n_future`` is below 1.
     """
     if n_future is not None:
         _check_count(n_future)
     known = scene.n_steps - n_encoded
     if known < (n_future or 1):
-        raise InputError(f"{scene.path}: {n_future or 1} steps to compare, but only {max(0, known)} after the input")
+        raise InputError(f"{scene.path}: {n_future or 1} steps to score, but only {max(0, known)} after the input")
     return n_future or known
 
 
@@ -129,32 +139,32 @@ def predict(
     edits: Sequence[Edit] = (),
     on_steps: Callable[[int], object] | None = None,
 ) -> Prediction:
-    """Encodes ``history`` steps of a scene from ``start`` and rolls out ``n_future`` steps, also beyond its last frame.
+    """Encodes the input steps of a scene from ``start`` and predicts ``n_future`` steps, also past its last frame.
 
     Args:
         restored: the model.
-        scene: whose frames are given.
+        scene: scene to predict.
         context_cams: input cameras.
-        n_future: steps to predict.
-        start: first given step.
-        edits: changes of the scene on the way.
-        on_steps: is called with the number of steps that have just been simulated.
+        n_future: number of steps to predict.
+        start: first input step.
+        edits: edits to apply during the rollout.
+        on_steps: called with the number of steps just simulated.
+
     Raises:
-        InputError: images of another size than in training, cameras and steps that the scene has not, or an edit that
-            cannot be made.
+        InputError: the image size differs from training, a camera or step does not exist, or an edit is invalid.
     """
     options = {"start": start, "edits": edits, "on_steps": on_steps}
     return predict_together(restored, [scene], n_future, [context_cams], **options)[0]
 
 
 def check_cameras(scene: Scene, cams: Sequence[int]) -> None:
-    """Raises InputError where the scene does not have one of ``cams``."""
+    """Raises InputError if one of ``cams`` does not exist in the scene."""
     if bad := [cam for cam in cams if not 0 <= cam < scene.n_cams]:
         raise InputError(f"{scene.path}: camera {bad[0]} does not exist; the scene has {scene.n_cams}")
 
 
 def encode_folder(restored: Restored, folder: str | Path, resample: bool = False) -> Particles:
-    """The first ``history`` steps of the scene in ``folder``, seen by its default views."""
+    """Encodes the first steps of the scene in ``folder`` from its default views."""
     scene = restored.open_scene(folder, resample=resample)
     return encode_steps(restored, scene, default_views(restored, scene)[0])
 
@@ -169,16 +179,16 @@ def predict_together(
     edits: Sequence[Edit] = (),
     on_steps: Callable[[int], object] | None = None,
 ) -> list[Prediction]:
-    """:func:`predict` of several scenes in one rollout.
+    """Predicts several scenes in one batched rollout, see :func:`predict`.
 
     Args:
         restored: the model.
-        scenes: to predict.
-        n_future: steps to predict.
-        contexts: input cameras of each scene; default: those of :func:`default_views`.
-        start: first given step.
-        edits: changes of the scenes on the way.
-        on_steps: is called with the number of steps that have just been simulated.
+        scenes: scenes to predict.
+        n_future: number of steps to predict.
+        contexts: input cameras of each scene. Default: those of :func:`default_views`.
+        start: first input step.
+        edits: edits to apply during the rollout.
+        on_steps: called with the number of steps just simulated.
     """
     _check_count(n_future)
 
@@ -208,7 +218,7 @@ def predict_together(
 
 
 def encode_steps(restored: Restored, scene: Scene, context_cams: Sequence[int], start: int = 0) -> Particles:
-    """``history`` steps of a scene from ``start``. Errors as in :func:`predict`."""
+    """Encodes the input steps of a scene from ``start``. Raises as :func:`predict`."""
     return _encode(restored, [scene], [context_cams], start)
 
 
@@ -222,14 +232,17 @@ def _encode(
 def input_frames(
     restored: Restored, scenes: Sequence[Scene], contexts: Sequence[Sequence[int]], start: int = 0
 ) -> Frames:
-    """Images of ``history`` steps of scenes from ``start``, by as many of the cameras ``contexts`` as the simulator's
-    setting says. Errors as in :func:`predict`."""
+    """Packs the input images of scenes from step ``start``; the simulator's setting may reduce the number of views.
+
+    Raises:
+        InputError: as :func:`predict`.
+    """
     n_encoded, most = restored.n_encoded, restored.simulator.setting.context_views
     for scene in scenes:
         restored.check_scene(scene)
         if not 0 <= start <= scene.n_steps - n_encoded:
             raise InputError(
-                f"{scene.path}: {n_encoded} steps from step {start} on do not fit its {scene.n_steps} steps"
+                f"{scene.path}: needs {n_encoded} steps from step {start}, but the scene has {scene.n_steps} steps"
             )
     if most is not None:
         contexts = [[cams[k * len(cams) // most] for k in range(min(most, len(cams)))] for cams in contexts]
@@ -239,9 +252,12 @@ def input_frames(
 
 @torch.no_grad()
 def render_steps(restored: Restored, particles: Particles, scene: Scene, cams: Sequence[int], start: int = 0) -> Tensor:
-    """Images [S, V, H, W, 3], clipped to [0, 1], of every cloud of one scene's particles, seen by cameras ``cams``.
+    """Renders every cloud of one scene's particles from cameras ``cams``.
 
-    The first cloud is step ``start`` of the scene, which matters where cameras move.
+    The first cloud is rendered with the cameras of step ``start`` (relevant for moving cameras).
+
+    Returns:
+        Images [S, V, H, W, 3], clamped to [0, 1].
     """
     n_steps, n_views = particles.n_clouds, len(cams)
     cameras = scene.cameras_at(cams, range(start, start + n_steps)).to(particles.means.device)
@@ -250,14 +266,15 @@ def render_steps(restored: Restored, particles: Particles, scene: Scene, cams: S
 
 
 def constant_velocity(prediction: Prediction) -> Particles:
-    """What may move goes on from the last encoded step at the speed of its centroid; one cloud a future step.
+    """Computes the constant-velocity baseline, one cloud per future step.
 
-    Nothing moves where there was one step only, or where one of the last two shows nothing that may move.
+    Movable particles of the last encoded step keep the velocity of their centroid. The velocity is 0 if there is only
+    one encoded step, or if one of the last two has no movable particles.
     """
     last = prediction.n_encoded - 1
     final = prediction.step(last)
     centroids = [
-        cloud.means[cloud.activity == DYNAMIC].mean(0)  # NaN where nothing may move
+        cloud.means[cloud.activity == DYNAMIC].mean(0)  # NaN without movable particles
         for cloud in (prediction.step(max(0, last - 1)), final)
     ]
     velocity = torch.nan_to_num(centroids[1] - centroids[0])
@@ -283,20 +300,20 @@ def score_scene(
     prediction: Prediction | None = None,
     start: int = 0,
 ) -> SceneScores:
-    """Predicts a scene from its first steps, or those from ``start`` on, and scores every method on the target views.
+    """Predicts a scene from its steps at ``start``, and scores every method on the target views.
 
     Args:
-        restored: the model; None: only ``others`` and ``copy`` are scored.
-        scene: to predict.
-        context_cams: input cameras; default: those of :func:`default_views`.
-        target_cams: cameras to compare; default: those of :func:`default_views`; without a model they must be given.
-        n_encoded: steps that the others were given; the model always takes those of its training.
-        n_future: steps to predict; default: to the end of the scene.
+        restored: the model; None scores only ``others`` and ``copy``.
+        scene: scene to predict.
+        context_cams: input cameras. Default: those of :func:`default_views`.
+        target_cams: target cameras. Default: those of :func:`default_views`; required without a model.
+        n_encoded: number of input steps of ``others``; the model uses its own.
+        n_future: number of steps to predict. Default: to the end of the scene.
         metrics: see :func:`gsim3d.evaluate.scoring.measurable`.
-        methods: of METHODS.
+        methods: subset of METHODS.
         others: predictions of other models.
-        prediction: what :func:`predict` gave for these cameras and steps; None: it is made here.
-        start: first given step; the scores begin there.
+        prediction: result of :func:`predict` for these cameras and steps. Default: computed here.
+        start: first input step, and first scored step.
     """
     if restored is not None:
         context_cams, target_cams = default_views(restored, scene, context_cams, target_cams)
@@ -330,7 +347,7 @@ def score_scene(
             }
         for other in others:
             theirs = other.images(scene, cams, n_given, n_future).to(device).float() / 255
-            if scene.recording.real_background and labels is not None:  # the video's own background is black there
+            if scene.recording.real_background and labels is not None:  # the true images are masked, too
                 theirs *= (labels[n_encoded:] != BACKGROUND)[..., None]
             yield other.name, theirs
         yield from ((name, make()) for name, make in baselines.items() if name in methods)
@@ -352,16 +369,19 @@ def score_scenes(
     processes: Processes | None = None,
     quiet: bool = True,
 ) -> list[SceneScores]:
-    """:func:`score_scene` of every scene, in their order; a GPU predicts several together.
+    """Scores scenes with :func:`score_scene`; a GPU predicts several per rollout.
 
     Args:
-        restored: as in :func:`score_scene`, like n_encoded, n_future, metrics, methods and others.
-        scenes: to predict.
+        restored, n_encoded, n_future, metrics, methods, others: see :func:`score_scene`.
+        scenes: scenes to predict.
         views: (context, target) cameras of each scene.
-        clips: of which FVD is measured, at most: those of scenes spread evenly.
-        processes: that share the scenes; every one must call it, and each returns all scores: those of one process,
-            bit for bit.
-        quiet: show no progress.
+        clips: largest number of clips for FVD, taken from evenly spaced scenes.
+        processes: processes that share the scenes. All must call this function, and all return the same scores, equal
+            in bits to those of a single process.
+        quiet: hide the progress bar.
+
+    Returns:
+        Scores in the order of ``scenes``.
     """
     processes = processes or Processes()
     groups = [[number] for number in range(len(scenes))]
@@ -388,7 +408,7 @@ def score_scenes(
             mine = first + processes.rank
             try:
                 found = [pair for group in groups[mine : mine + 1] for pair in scored(group)]
-            except (InputError, NumericalError) as error:  # raised in all processes: none waits for another
+            except (InputError, NumericalError) as error:  # gathered and raised in all processes, to avoid a deadlock
                 found = error
             for share in processes.gather(found):
                 if isinstance(share, Exception):
@@ -399,9 +419,9 @@ def score_scenes(
 
 
 def _batches(restored: Restored, scenes: Sequence[Scene], contexts: Sequence[Sequence[int]]) -> list[list[int]]:
-    """Numbers of the scenes that are predicted together: neighbours, alone on a CPU.
+    """Groups consecutive scenes into batches on a GPU; on a CPU every scene is its own batch.
 
-    They depend on the scenes and the device only, so that any number of processes gets the same numbers.
+    Batches do not depend on the number of processes, so that scores do not either.
     """
     found: list[list[int]] = []
     for number, (scene, context) in enumerate(zip(scenes, contexts, strict=True)):
@@ -417,7 +437,7 @@ def _batches(restored: Restored, scenes: Sequence[Scene], contexts: Sequence[Seq
 
 @contextmanager
 def _two_threads() -> Iterator[None]:
-    """At least two: with one, torch convolves by other kernels, and torchrun gives each process one."""
+    """Runs torch with at least two threads: with one, as set by torchrun, its convolutions use other kernels."""
     n_threads = torch.get_num_threads()
     torch.set_num_threads(max(2, n_threads))
     try:
@@ -427,7 +447,7 @@ def _two_threads() -> Iterator[None]:
 
 
 def _digest(images: Tensor, labels: Tensor | None) -> str:
-    """Hash of the true images and labels."""
+    """Returns a hash of the true images and labels."""
     digest = hashlib.sha256(repr([images.shape, labels is None]).encode())
     for values in (images, labels):
         if values is not None:
@@ -444,7 +464,7 @@ def _held(
     cams: Sequence[int],
     start: int = 0,
 ) -> Tensor:
-    """Images of the predicted steps that would be seen if everything stood still as it is at cloud ``step``."""
+    """Renders the predicted steps with the particles of cloud ``step`` held constant."""
     later = range(prediction.n_encoded, prediction.n_steps)
     if not scene.cameras_move:
         return rendered[step].expand(len(later), *rendered.shape[1:])

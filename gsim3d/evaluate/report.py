@@ -1,4 +1,4 @@
-"""Scores of many scenes in one place: means over scenes by step, then over steps; as JSON, CSV, markdown and text."""
+"""Aggregation of scores over scenes and steps, and reports as JSON, CSV, markdown and text."""
 
 from __future__ import annotations
 
@@ -20,26 +20,30 @@ from gsim3d.io.files import write_whole
 from gsim3d.synth.held_out import describe_set
 
 REGIONS = (
-    "masked: without background; body: what may move; ground: the rest of the mask; ring: ground within "
+    "masked: foreground; body: movable bodies; ground: the rest of the foreground; ring: ground within "
     f"{RING_WIDTH:g} diameters of a body"
 )
-ADDED = ("masked", "body", "ground")  # parts of the mask of which it is said how much error the future adds
+ADDED = ("masked", "body", "ground")  # regions for which added_mse is reported
 
 
 def summarize(scores: Sequence[SceneScores], not_measured: dict[str, str] | None = None) -> dict:
-    """What metrics.json holds.
+    """Aggregates scores to the content of metrics.json.
 
-    ``past.M`` and ``future.M``: the mean over steps of the mean over scenes of metric M; ``future_late.M`` over the
-    second half of the horizon only; ``future_std.M``: the mean over steps of the standard deviation between scenes. The
-    same with a prefix (``constant.``, ``copy.``, the name of other predictions) for all methods but the model.
-    ``body_share``: share of the mask that bodies cover. ``added_mse.P``: the error that the future adds: 10^(-PSNR /
-    10) of a scene at a step in part P of the mask, the mean over predicted steps less that over given ones.
-    ``future.fvd``: one distance between all predicted clips and the true ones; it has neither steps nor deviation.
-    ``by_step``, ``by_step_std``: means over scenes, and deviations between them, for each step. A value that does not
-    exist (an empty mask everywhere, one scene's deviation) is null. ``not_measured``: metric -> why.
+    - ``past.M``, ``future.M``, ``future_late.M``: mean of metric M over scenes, then over input steps, predicted steps,
+      or the second half of the predicted steps.
+    - ``past_std.M``, ``future_std.M``: mean over steps of the standard deviation between scenes.
+    - ``<method>.future.M``: the same for baselines and other predictions.
+    - ``future.fvd``: distance between all predicted and all true clips.
+    - ``body_share``: fraction of the foreground covered by bodies.
+    - ``added_mse.R``: mean squared error in region R, predicted steps minus input steps.
+    - ``by_step``, ``by_step_std``: mean over scenes and deviation between scenes, for each step.
+    - ``not_measured``: metric -> reason.
+
+    Undefined values (empty masks, the deviation of a single scene) are null.
 
     Args:
-        not_measured: what was not even tried.
+        scores: scores of one or more scenes.
+        not_measured: metrics that were not requested -> reason.
     """
     n_encoded = scores[0].n_encoded
     methods = [method for method in scores[0].values if all(method in s.values for s in scores)]
@@ -92,14 +96,14 @@ def _add_fvd(result: dict, missing: dict, scores: Sequence[SceneScores]) -> None
     truth = clips.pop("truth")
     result["n_clips"] = len(truth)
     if len(truth) < MIN_CLIPS:
-        missing["fvd"] = f"it needs {MIN_CLIPS} clips (scenes times target views); there is one"
+        missing["fvd"] = f"at least {MIN_CLIPS} clips (scenes times target views) are required; there is 1"
         return
     for method, features in clips.items():
         result[f"{_prefix(method)}future.fvd"] = frechet_distance(features, truth)
 
 
 def _of_scene(scores: SceneScores, missing: dict) -> dict:
-    """Means over the parts of the horizon, the share of bodies, and what the future adds to the model's error."""
+    """Aggregates the scores of one scene over steps, see :func:`summarize`."""
     first, late = scores.n_encoded, (scores.n_encoded + scores.n_steps) // 2
     parts = {"past": slice(first), "future": slice(first, None), "future_late": slice(late, None)}
     found = {"digest": scores.digest} if scores.digest else {}
@@ -118,14 +122,14 @@ def _of_scene(scores: SceneScores, missing: dict) -> dict:
 
 
 def write_json(path: str | Path, content: dict) -> None:
-    """Writes ``content``; the file appears complete or not at all."""
+    """Writes ``content`` atomically."""
     write_whole(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
 def write_csv(path: str | Path, scores: Sequence[SceneScores]) -> None:
-    """One row for each scene, method and step: scene, method, step, part (given or predicted), then the metrics.
+    """Writes one row per scene, method and step: scene, method, step, part (given or predicted), and the metrics.
 
-    A value that does not exist is empty. FVD, a distance between sets of clips, has no place in it.
+    Undefined values are empty. FVD is not included, because it has no value per step.
     """
     metrics = [name for name in METRICS if any(name in s.values[method] for s in scores for method in s.values)]
     text = io.StringIO()
@@ -142,7 +146,7 @@ def write_csv(path: str | Path, scores: Sequence[SceneScores]) -> None:
 
 
 def markdown(summary: dict, dataset: str) -> str:
-    """Tables as the paper prints them: a row for each method, mean and deviation between scenes; then the horizons."""
+    """Formats the summary as markdown: mean ± deviation per method, as in the paper; then means per part."""
     shown = [m for m in METRICS if any(f"{_prefix(method)}future.{m}" in summary for method in summary["methods"])]
     span = f"{summary['n_encoded_steps']}-{summary['n_future_steps']}"
     head = [f"{METRICS[m].label} ({'↑' if METRICS[m].rises else '↓'})" for m in shown]
@@ -164,28 +168,28 @@ def markdown(summary: dict, dataset: str) -> str:
 
 
 def facts(summary: dict) -> list[str]:
-    """Which set was scored, how large its bodies are in the images, and what the future adds to the error."""
+    """Describes the data set, the size of its bodies, and the error added by prediction."""
     found = [describe_set(summary["set"])] if summary.get("set") else []
     if summary.get("body_share") is not None:
-        found.append(f"Bodies: {summary['body_share']:.1%} of the mask.")
+        found.append(f"Bodies: {summary['body_share']:.1%} of the foreground.")
     added = {part: value for part in ADDED if (value := summary.get(f"added_mse.{part}")) is not None}
     if added:
         decibels = {part: f" ({-10 * math.log10(mse):.2f} dB)" for part, mse in added.items() if mse > 0}
         numbers = ", ".join(f"{part} {mse:.5f}{decibels.get(part, '')}" for part, mse in added.items())
-        found.append(f"Mean squared error that the future adds to that of given steps: {numbers}.")
+        found.append(f"Mean squared error, predicted minus given steps: {numbers}.")
     return found
 
 
 def notes(summary: dict) -> list[str]:
-    """What a reader of the numbers must know: metrics that were not measured, and an FVD of too few clips."""
+    """Returns caveats: metrics that were not measured, and an FVD from too few clips."""
     found = [f"{METRICS[m].label}: not measured: {reason}" for m, reason in summary["not_measured"].items()]
     if 0 < summary.get("n_clips", 0) < TREND_CLIPS and "fvd" not in summary["not_measured"]:
-        found.append(f"FVD: of {summary['n_clips']} clips; below {TREND_CLIPS} it shows a trend, not a measurement")
+        found.append(f"FVD: {summary['n_clips']} clips; with fewer than {TREND_CLIPS} it is biased and noisy")
     return found
 
 
 def table(summary: dict) -> str:
-    """The summary for people: one line a method, then the first method by step."""
+    """Formats the summary as text: one line per method, then the first method by step."""
     methods = summary["methods"]
     shown = [m for m in METRICS if f"{_prefix(methods[0])}future.{m}" in summary]
     by_step = [m for m in shown if METRICS[m].by_step]
@@ -229,7 +233,7 @@ def _with_deviation(summary: dict, key: str, metric: str) -> str:
 
 
 def _deviation(table: Tensor) -> Tensor:
-    """Standard deviation [S] over the scenes (n - 1) of [scenes, S] that have a value; NaN where fewer than two do."""
+    """Returns the sample standard deviation [S] over scenes of [scenes, S], ignoring NaN; NaN for fewer than two."""
     counted = (~table.isnan()).sum(0)
     squares = (table - table.nanmean(0)).square().nansum(0)
     return torch.where(counted > 1, squares / (counted - 1).clamp(min=1), torch.nan).sqrt()

@@ -1,4 +1,4 @@
-"""Which metrics there are, and what predicted images of one scene score by step."""
+"""Registry of metrics, and per-step scores of the predicted images of one scene."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class Metric:
     """A metric of predicted images.
 
     Attributes:
-        label: its name in tables.
-        digits: after the point.
-        rises: whether more is better.
-        weights: what must be installed to measure it (a key of gsim3d.evaluate.perceptual.weights.SOURCES), or nothing.
-        by_step: whether each image has a value of its own.
+        label: name in tables.
+        digits: number of decimals in tables.
+        rises: whether higher is better.
+        weights: weights that it needs, a key of gsim3d.evaluate.perceptual.weights.SOURCES; None if it needs none.
+        by_step: whether it has a value for each image.
     """
 
     label: str
@@ -47,9 +47,9 @@ METRICS = {
 }
 PLAIN_METRICS = tuple(name for name, metric in METRICS.items() if metric.weights is None)
 NEEDS_LABELS = ("psnr_masked", "psnr_body", "psnr_ground", "psnr_ring")
-# Images of "constant" in which the pixels of one label are exact: what the other pixels cost.
+# Baselines: images of "constant" with true pixels where the label is the given one.
 EXACT_PARTS = {"perfect_ground": FIXED, "perfect_body": MOVING}
-RING_WIDTH = 0.3  # of the diameter of a body in the image
+RING_WIDTH = 0.3  # in diameters of the body
 
 
 @dataclass(frozen=True)
@@ -57,15 +57,16 @@ class SceneScores:
     """Scores of one scene.
 
     Attributes:
-        scene: its name.
-        n_encoded: given steps.
-        n_steps: all steps, S.
-        values: method -> metric -> float64 [S] by step, means over the target views. Steps before ``n_encoded`` are
-            reconstructions, which only the model has; a value that no image has (that step, or an empty mask) is NaN.
+        scene: name of the scene.
+        n_encoded: number of input steps.
+        n_steps: number of all steps, S.
+        values: method -> metric -> float64 [S], mean over the target views at each step. Steps before ``n_encoded`` are
+            reconstructions of the model and NaN for other methods; steps with empty masks are NaN.
         clips: method (and ``"truth"``) -> I3D features [V, 400] of the predicted steps in each target view, for FVD.
-        not_measured: metric -> why this scene has no value.
-        body_share: float64 [S], share of the mask that bodies cover, mean over the target views; None without labels.
-        digest: hash of the true images and labels that were compared.
+        not_measured: metric -> reason why it has no value.
+        body_share: float64 [S], fraction of the foreground covered by bodies, mean over the target views; None without
+            labels.
+        digest: hash of the true images and labels.
     """
 
     scene: str
@@ -79,12 +80,13 @@ class SceneScores:
 
 
 def ring_around_bodies(labels: Tensor) -> Tensor:
-    """Ground within ``RING_WIDTH`` diameters of the nearest body, where its shadow falls.
+    """Marks the ground within ``RING_WIDTH`` diameters of the nearest body, where shadows fall.
 
-    The diameter of a body (a connected region that moves) is that of a disc of as many pixels.
+    Bodies are connected components of MOVING pixels; the diameter is that of a disc of equal area.
 
     Args:
         labels: uint8 [..., H, W].
+
     Returns:
         bool [..., H, W], on the device of ``labels``.
     """
@@ -103,10 +105,13 @@ def ring_around_bodies(labels: Tensor) -> Tensor:
 
 
 def measurable(names: Sequence[str] | None = None) -> tuple[tuple[str, ...], dict[str, str]]:
-    """(metrics to measure, {metric: why not}): those named, or all whose weights are installed.
+    """Returns (metrics to measure, {other metric: reason}).
+
+    Args:
+        names: metrics to measure. Default: all whose weights are installed.
 
     Raises:
-        InputError: a metric does not exist, or one that was named has no weights here.
+        InputError: a metric does not exist, or its weights are not installed.
     """
     missing = {n: m.weights for n, m in METRICS.items() if m.weights and not weights.installed(m.weights)}
     if names is None:
@@ -123,15 +128,15 @@ def measurable(names: Sequence[str] | None = None) -> tuple[tuple[str, ...], dic
 
 
 class SceneTruth:
-    """What predictions of one scene are compared with.
+    """Ground truth of one scene, which scores predicted images.
 
     Args:
-        name: of the scene.
+        name: name of the scene.
         images: [S, V, H, W, 3], colours in [0, 1].
-        labels: uint8 [S, V, H, W], 0 background, 3 bodies that may move; None: the scene has none.
-        valid: bool [S, V, H, W], pixels that count; the others are black in the recording; None: all.
-        n_encoded: steps that were given.
-        metrics: to measure; what does not apply here goes to ``not_measured``.
+        labels: uint8 [S, V, H, W]: 0 background, 1 static geometry, 3 movable bodies; None if the scene has none.
+        valid: bool [S, V, H, W], pixels to score; the others are black in the recording. None: all.
+        n_encoded: number of input steps.
+        metrics: metrics to measure; those that do not apply are listed in ``not_measured``.
     """
 
     def __init__(
@@ -154,9 +159,10 @@ class SceneTruth:
                 self.masks["psnr_ring"] = ring_around_bodies(labels)
 
     def score(self, methods: Iterable[tuple[str, Tensor]]) -> SceneScores:
-        """Scores of (name, images) one after another, so that only one method's images need to be in memory.
+        """Scores methods one at a time, so that only one method's images are in memory.
 
-        Images are [S, V, H, W, 3], colours in [0, 1], or only the predicted steps of them.
+        Args:
+            methods: (name, images); images are [S, V, H, W, 3] in [0, 1], for all steps or only the predicted ones.
         """
         values, clips, parts = {}, {}, {}
         with_clips = "fvd" in self.metrics
@@ -177,26 +183,26 @@ class SceneTruth:
         return SceneScores(self.name, self.n_encoded, n_steps, values, clips, self.not_measured, share)
 
     def _body_share(self) -> Tensor | None:
-        """float64 [S]; NaN at steps without a mask."""
+        """Returns float64 [S]; NaN at steps without foreground."""
         if self.labels is None:
             return None
         bodies, mask = (self.masks[f"psnr_{region}"].sum((2, 3)).double() for region in ("body", "masked"))
         return (bodies / mask).nanmean(1).cpu()
 
     def _problem(self, metric: str) -> str | None:
-        """Why ``metric`` cannot be measured here."""
+        """Returns the reason why ``metric`` does not apply to this scene; None if it does."""
         n_steps, _, height, width = self.images.shape[:4]
         smallest = {"ssim": SSIM_WINDOW, "lpips_alex": lpips.MIN_SIZE["alex"], "lpips_vgg": lpips.MIN_SIZE["vgg"]}
         if metric in NEEDS_LABELS and self.labels is None:
             return f"{self.name} has no segmentation"
         if min(height, width) < smallest.get(metric, 1):
-            return f"{self.name} has images of {width}x{height} pixels; it needs {smallest[metric]}"
+            return f"{self.name} has images of {width}x{height} pixels; at least {smallest[metric]} are required"
         if metric == "fvd" and n_steps - self.n_encoded < fvd.MIN_FRAMES:
-            return f"it needs {fvd.MIN_FRAMES} predicted steps; {self.name} has {n_steps - self.n_encoded}"
+            return f"{fvd.MIN_FRAMES} predicted steps are required; {self.name} has {n_steps - self.n_encoded}"
         return None
 
     def _by_step(self, images: Tensor, metrics: Sequence[str]) -> dict[str, Tensor]:
-        """Metric -> float64 [S], means over the views that have a value; NaN for steps without images."""
+        """Returns metric -> float64 [S], mean over views ignoring NaN; NaN for steps without images."""
         n_steps = len(self.images)
         scores = {m: torch.full((n_steps,), torch.nan, dtype=torch.float64) for m in metrics if METRICS[m].by_step}
         for step, pred in enumerate(images, n_steps - len(images)):
@@ -205,7 +211,7 @@ class SceneTruth:
         return scores
 
     def _measured(self, metric: str, pred: Tensor, true: Tensor, step: int) -> Tensor:
-        """[V] of one step."""
+        """Returns the values [V] of one step."""
         if metric == "ssim":
             return ssim(pred, true)
         if metric.startswith("lpips"):
@@ -214,6 +220,6 @@ class SceneTruth:
         return psnr(pred, true, None if mask is None else mask[step])
 
     def _clip_features(self, images: Tensor) -> Tensor:
-        """[V, 400], of the predicted steps."""
+        """Returns the I3D features [V, 400] of the predicted steps."""
         n_future = len(self.images) - self.n_encoded
         return fvd.clip_features(images[-n_future:].transpose(0, 1)).cpu()

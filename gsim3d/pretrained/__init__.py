@@ -1,8 +1,8 @@
-"""Trained simulators that come with gsim3d: a folder each, named like the model, whose name stands for its checkpoint.
+"""Trained simulators shipped with gsim3d, one folder per model; a folder's name can be used as a checkpoint.
 
-A folder holds model.safetensors (bfloat16 weights with their configuration), config.yaml, training.jsonl (the log),
-recipe.json (what it was trained on, and for how long), scores.json, README.md, the model card, and laws.json where
-the model breaks laws of docs/results/stability.md: the worst number of each, as the card has it.
+Files: model.safetensors (bfloat16 weights with configuration), config.yaml, training.jsonl (log), recipe.json (training
+data and duration), scores.json, README.md (model card), and laws.json if the model violates invariances of
+docs/results/stability.md (the worst error of each).
 """
 
 from __future__ import annotations
@@ -14,47 +14,47 @@ from gsim3d.errors import InputError, did_you_mean
 
 FOLDER = Path(__file__).parent
 WEIGHTS, CONFIG, LAWS = "model.safetensors", "config.yaml", "laws.json"
-CHECKPOINT_HELP = "run folder, checkpoint folder, .safetensors file, or name of a simulator that comes with gsim3d"
-KEEP = ("image", "depth")  # parts of a scene that need not be fitted to a model
+CHECKPOINT_HELP = "run folder, checkpoint folder, .safetensors file, or name of a shipped simulator"
+KEEP = ("image", "depth")  # parts of a scene that can be excluded from fitting to a model
 
 
 def known_failures(checkpoint: str | Path) -> dict[str, dict]:
-    """Check -> {"what", "error", "bound"}: what a simulator that comes with gsim3d is known to break; {} of others."""
+    """Returns check -> {"what", "error", "bound"}, the known failures of a shipped simulator; {} for others."""
     folder = Path(checkpoint).resolve().parent
     file = folder / LAWS
     return json.loads(file.read_text()) if folder.parent == FOLDER.resolve() and file.is_file() else {}
 
 
 def names() -> list[str]:
-    """Those that are here."""
+    """Returns the names of the shipped simulators."""
     return sorted(file.parent.name for file in FOLDER.glob(f"*/{WEIGHTS}"))
 
 
 def located(checkpoint: str | Path) -> Path:
-    """What a CHECKPOINT argument means: a path that exists, or else the weights of the simulator of this name.
+    """Resolves a CHECKPOINT argument: an existing path, or else the weights of the shipped simulator of this name.
 
     Raises:
-        InputError: neither; the message lists the names.
+        InputError: neither exists; the message lists the names.
     """
     path = Path(checkpoint)
     if path.exists():
         return path
     if str(checkpoint) in names():
         return FOLDER / str(checkpoint) / WEIGHTS
-    known = f"simulators that come with gsim3d: {', '.join(names())}" if names() else "none comes with gsim3d"
+    known = f"shipped simulators: {', '.join(names()) or 'none'}"
     raise InputError(f"{checkpoint}: no such checkpoint ({known}{did_you_mean(checkpoint, names())})")
 
 
 def folder_of(checkpoint: str | Path) -> Path:
-    """The folder in or beside which the weights of a checkpoint are. Raises InputError as :func:`located`."""
+    """Returns the folder of a checkpoint, or of its weight file. Raises InputError as :func:`located`."""
     path = located(checkpoint)
     return path if path.is_dir() else path.parent
 
 
 def frame_rate(checkpoint: str | Path) -> float | None:
-    """Frames per second of the training of a simulator that comes with gsim3d; None: of others, or not stated.
+    """Returns the training frame rate of a shipped simulator from its config.yaml; None for others, or if absent.
 
-    Its config.yaml says so where the metadata of its weights, which are older, do not.
+    Needed because the metadata of older weight files do not contain it.
     """
     config = located(checkpoint).resolve().parent / CONFIG
     if not config.is_relative_to(FOLDER.resolve()) or not config.is_file():

@@ -1,4 +1,4 @@
-"""From checkpoints to simulators: what a saved configuration describes, and weights that fit it."""
+"""Loading and saving of simulators: parses a saved configuration and validates weights against it."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ Model = TypeVar("Model", bound=nn.Module)
 
 @dataclass(frozen=True)
 class Description:
-    """What a checkpoint's configuration says of its simulator.
+    """Parsed configuration of a checkpoint.
 
     Attributes:
-        model: sizes of its parts.
-        effects: what it was trained to simulate.
-        inputs: what it was trained on; None: the configuration does not say.
+        model: model configuration.
+        effects: effects that the model was trained to simulate.
+        inputs: input specification of the training; None if unknown.
     """
 
     model: ModelConfig
@@ -46,7 +46,7 @@ class Description:
     inputs: InputSpec | None
 
     def to_dict(self) -> dict[str, Any]:
-        """The content of a checkpoint's config.yaml."""
+        """Returns the content of a checkpoint's config.yaml."""
         data = {} if self.inputs is None else {k: v for k, v in to_dict(self.inputs).items() if v is not None}
         effects = {"spec": self.effects.to_dict(), "hash": self.effects.hash}
         return {"model": to_dict(self.model), "data": data, "effects": effects}
@@ -55,12 +55,17 @@ class Description:
 def load(
     kinds: Sequence[type[Model]], name_or_path: str | Path, device: str, speed: str
 ) -> tuple[Model, checkpoint.Checkpoint]:
-    """The simulator of a checkpoint, as :meth:`gsim3d.Simulator.from_pretrained`, and what the checkpoint holds.
+    """Loads the simulator of a checkpoint, see :meth:`gsim3d.Simulator.from_pretrained`.
 
     Args:
         kinds: simulator classes that may be loaded.
+        name_or_path, device, speed: see :meth:`gsim3d.Simulator.from_pretrained`.
+
+    Returns:
+        The simulator and its checkpoint.
+
     Raises:
-        InputError: as there; the message starts with ``name_or_path``.
+        InputError: as :meth:`gsim3d.Simulator.from_pretrained`; the message starts with ``name_or_path``.
     """
     check_device(device)
     saved = checkpoint.load(name_or_path)
@@ -68,17 +73,16 @@ def load(
     cls = next((kind for kind in kinds if released == (kind.config_class is not ModelConfig)), None)
     if cls is None:
         wanted = "gsim3d.compat.load_released" if released else "Simulator.from_pretrained"
-        raise InputError(f"{name_or_path}: a checkpoint of another kind of model; load it with {wanted}")
+        raise InputError(f"{name_or_path}: checkpoint of another kind of model; load it with {wanted}")
     try:
         setting = load_speed(pretrained.folder_of(name_or_path), saved.digest, torch.device(device).type, speed)
         found = describe(saved.config, cls.config_class, pretrained.frame_rate(name_or_path))
         simulator = with_weights(cls, setting.of_model(found.model), found.effects, saved.weights)
     except InputError as error:
         raise InputError(f"{name_or_path}: {error}") from None
-    except Exception as error:  # a configuration that describes no model raises anything
-        said = " ".join(str(error).split())[:200]
-        kind = type(error).__name__
-        raise InputError(f"{name_or_path}: its configuration describes no model: {kind}: {said}") from None
+    except Exception as error:  # an invalid configuration can raise any exception
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        raise InputError(f"{name_or_path}: its configuration is not a valid model: {reason}") from None
     asymmetric = simulator.config.dynamics.is_asymmetric
     simulator.effects, simulator.setting = setting.of_effects(found.effects, asymmetric), setting
     simulator.inputs = setting.of_inputs(found.inputs)
@@ -86,28 +90,29 @@ def load(
 
 
 def save(simulator: nn.Module, folder: Path) -> Path:
-    """:meth:`gsim3d.Simulator.save_pretrained` of ``simulator`` to ``folder``."""
+    """Saves ``simulator`` to ``folder``, see :meth:`gsim3d.Simulator.save_pretrained`."""
     if folder.exists() and not (folder / checkpoint.STATE).is_file():
-        raise InputError(f"{folder}: exists and is no checkpoint; name a new folder")
+        raise InputError(f"{folder}: exists and is not a checkpoint; use a new folder")
     config = Description(simulator.config, simulator.effects, simulator.inputs).to_dict()
     folder.parent.mkdir(parents=True, exist_ok=True)
     return checkpoint.write(folder, checkpoint.Checkpoint(simulator.state_dict(), config, {"step": 0}))
 
 
 def is_released(config: dict[str, Any]) -> bool:
-    """Whether a saved configuration is that of the published model."""
+    """Returns whether a saved configuration is one of the published model."""
     return current_model(config["model"]).get("release") is True
 
 
 def describe(config: dict[str, Any], kind: type[ModelConfig] = ModelConfig, fps: float | None = None) -> Description:
-    """What the saved configuration ``config`` says.
+    """Parses a saved configuration.
 
     Args:
         config: content of a checkpoint's config.yaml.
         kind: class of the model's configuration.
-        fps: frames per second where ``config`` has none.
+        fps: default of frames per second.
+
     Raises:
-        InputError: it describes no model; the message names the key.
+        InputError: the configuration is invalid; the message names the key.
     """
     model = from_dict(kind, current_model(config["model"]), "model")
     effects = EffectsSpec.from_dict(config.get("effects", {}).get("spec"))
@@ -124,10 +129,10 @@ def describe(config: dict[str, Any], kind: type[ModelConfig] = ModelConfig, fps:
 
 
 def build(make: Callable[[ModelConfig], Model], config: ModelConfig, seed: int = 0) -> Model:
-    """A simulator whose first weights are a function of the seed; torch's own random state stays as it was.
+    """Builds a simulator with weights initialised from ``seed``; preserves torch's random state.
 
     Raises:
-        InputError: no model has these sizes.
+        InputError: the sizes are not valid.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -135,15 +140,18 @@ def build(make: Callable[[ModelConfig], Model], config: ModelConfig, seed: int =
             return make(config)
         except InputError:
             raise
-        except Exception as error:  # sizes of which no layer can be made raise anything
-            said = " ".join(str(error).split())[:200]
-            raise InputError(f"model: no model has these sizes: {type(error).__name__}: {said}") from None
+        except Exception as error:  # invalid layer sizes can raise any exception
+            reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+            raise InputError(f"model: sizes are not valid: {reason}") from None
 
 
 def with_weights(
     make: Callable[[ModelConfig], Model], config: ModelConfig, effects: EffectsSpec, weights: dict[str, Tensor]
 ) -> Model:
-    """A simulator with ``weights``; its own first ones, named in ``absent``, where no effect reads them.
+    """Builds a simulator with ``weights``.
+
+    Weights that ``effects`` do not use may be missing: they keep their initial values and are listed in
+    ``simulator.absent``.
 
     Raises:
         InputError: the weights do not fit the model.
@@ -161,7 +169,7 @@ def with_weights(
 
 
 class _WithoutFirstWeights(TorchFunctionMode):
-    """Within it tensors without memory stay as they are; else torch would import its compiler to fill them."""
+    """Mode that skips initialisation of meta tensors, for which torch would import its compiler."""
 
     def __torch_function__(self, function, types, args=(), kwargs=None):
         if function.__name__.endswith(("normal_", "uniform_")):
@@ -170,7 +178,7 @@ class _WithoutFirstWeights(TorchFunctionMode):
 
 
 def first_weights(simulator: nn.Module, effects: EffectsSpec, weights: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The simulator's own weights that no effect of ``effects`` reads, so that they need not be among ``weights``."""
+    """Returns the initial values of weights that ``effects`` do not use and that are missing in ``weights``."""
     lacks = set(simulator.plan(effects).unused).difference(weights)
     return {name: value for name, value in simulator.state_dict().items() if name in lacks}
 
@@ -178,14 +186,14 @@ def first_weights(simulator: nn.Module, effects: EffectsSpec, weights: dict[str,
 def check_sizes(
     make: Callable[[ModelConfig], nn.Module], config: ModelConfig, effects: EffectsSpec, weights: dict[str, Tensor]
 ) -> None:
-    """Raises RuntimeError where ``config`` describes other weights than those, before it takes memory for its own."""
+    """Raises RuntimeError if ``weights`` do not fit ``config``, without allocating the model."""
     n_most, n_made = sum(value.numel() for value in weights.values()), 0
 
     def count(_module, _name, value):
         nonlocal n_made
         n_made += 1 if value is None else max(1, value.numel())
-        if n_made > 2 * n_most:  # some are made more than once
-            raise RuntimeError(f"it has more than twice their {n_most} numbers")
+        if n_made > 2 * n_most:  # constructors may register a parameter more than once
+            raise RuntimeError(f"it has more than twice their {n_most} values")
 
     n_blocks = sum(config.dynamics.encoder_depths) + sum(config.dynamics.decoder_depths)
     if n_blocks > len(weights):
@@ -202,7 +210,7 @@ def check_sizes(
 
 
 def check_device(device: str) -> None:
-    """Raises InputError unless torch can compute on ``device``, such as "cpu" or "cuda"."""
+    """Raises InputError if ``device`` ("cpu" or "cuda") is not available."""
     try:
         kind = torch.device(device).type
     except (RuntimeError, TypeError):

@@ -1,10 +1,10 @@
-"""Loss and gradients of a training step as one CUDA graph.
+"""Loss and gradients of a training step as a CUDA graph.
 
-A training step launches tens of thousands of small kernels; a GPU would wait for Python most of the time. All of it
-(encoder, rollout, images, loss and their gradients) is captured once for each kind of batch and replayed with other
-images. A graph has fixed sizes: each cloud has as many particles as the largest, padding particles sleep, and
-geometry has capacity for more than was observed. Where a batch needs more, the graph is made anew, so results never
-depend on the capacity. Graphs have memory of their own as long as the GPU can hold all of them, then they share it.
+A training step launches tens of thousands of small kernels, so that a GPU mostly waits for Python. The whole step
+(encoder, rollout, images, loss, gradients) is captured once per kind of batch and replayed with other images. A graph
+has static shapes: clouds are padded to the largest one with sleeping particles, and geometry has spare capacity. A
+batch that exceeds the capacity triggers a new capture, so results do not depend on it. Each graph has its own memory
+pool; when the GPU's memory is exhausted, graphs share one.
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ from gsim3d.state import ASLEEP, DYNAMIC, Particles
 from gsim3d.train.gradients import in_segments, recomputing
 from gsim3d.train.samples import Batch
 
-FACTOR = 1.5  # capacity for geometry over what was observed: little costs captures, much costs time in every step
-PARTICLES_FACTOR = 1.15  # the same, for the particles of a cloud
-PARTICLES_UNIT = 256  # the capacity of a cloud is a multiple of it
-MOST_KINDS = 4  # of steps whose graphs are kept at a time
+FACTOR = 1.5  # geometry capacity over the observed size; smaller causes more captures, larger makes steps slower
+PARTICLES_FACTOR = 1.15  # capacity of a cloud over the observed number of particles
+PARTICLES_UNIT = 256  # cloud capacities are multiples of it
+MOST_KINDS = 4  # graphs kept at a time
 
 
 @dataclass(frozen=True)
 class Gradients:
-    """What a call of :class:`CapturedLoss` found.
+    """Result of a call of :class:`CapturedLoss`.
 
     Attributes:
-        loss: a number.
+        loss: scalar.
         errors: [S], mean squared error of each step.
-        parameters: gradients of ``CapturedLoss.parameters``, or None.
+        parameters: gradient of each of ``CapturedLoss.parameters``; None if the loss does not depend on it.
     """
 
     loss: Tensor
@@ -60,13 +60,13 @@ class Gradients:
 
 @dataclass(frozen=True)
 class Prepared:
-    """A batch and what the host must know of it before its graph can run.
+    """A batch with the sizes that the host needs to run its graph.
 
     Attributes:
         batch: the batch.
-        counts: particles of each cloud.
-        moving: of one cloud at most, that may move.
-        shapes: static shapes of the encoder for it.
+        counts: number of particles of each cloud.
+        moving: largest number of movable particles of a cloud.
+        shapes: static shapes of the encoder.
     """
 
     batch: Batch
@@ -76,39 +76,37 @@ class Prepared:
 
     @property
     def kind(self) -> tuple:
-        """What batches have in common that one graph serves."""
+        """Key of the graph: batches of equal kind can use the same one."""
         batch, table = self.batch, self.shapes.clouds
         images = len(batch.context.cameras), len(batch.targets.cameras)
         return table.scenes, table.steps, batch.n_future, batch.cut, images
 
 
 def check_capturable(config: DynamicsConfig) -> None:
-    """Raises InputError for a model whose training steps no graph can repeat."""
+    """Raises InputError if training steps of the model cannot be captured in a CUDA graph."""
     if config.drop_path or config.shuffle_orders or config.norm == "batch" or config.is_asymmetric:
         wanted = 'drop_path 0, shuffle_orders false, norm "layer" and a symmetric background'
         raise InputError(f"captured: the model must have {wanted}")
 
 
 class CapturedLoss:
-    """The loss of batches of one kind, and its gradients.
-
-    Without a GPU the same is computed call by call.
+    """Computes the loss of a batch and its gradients with CUDA graphs; without a GPU, step by step.
 
     Args:
-        simulator: that is trained; without drop path and shuffled curves, whose draws a graph would repeat.
-        plan: what a step computes.
-        loss: (images [I, H, W, 3], targets, weights of the steps) -> loss and errors by step.
-        precision: makes the context in which a part ("encoder", "dynamics", "renderer") computes.
-        recompute: of TrainConfig.
+        simulator: model to train, without drop path and shuffled curves, whose random draws a graph would repeat.
+        plan: plan of the training.
+        loss: function (images [I, H, W, 3], targets, weights of the steps) -> loss and errors by step.
+        precision: function that returns the autocast context of a part ("encoder", "dynamics", "renderer").
+        recompute: see TrainConfig.
 
     Attributes:
-        parameters: those whose gradients it returns, all of the simulator.
-        alone: a context in which no other thread uses the GPU, for captures.
-        meanwhile: is called in every call, while the graph runs: what else the host has to do delays no kernel then.
-        captures: count of graphs that were made.
-        most_particles: that any cloud had so far.
-        most_moving: those of them that may move.
-        most: sizes of geometry that any simulated step needed so far, by scenes and times of the encoded clouds.
+        parameters: all parameters of the simulator, in the order of the gradients returned.
+        alone: context in which no other thread uses the GPU, entered for captures.
+        meanwhile: called while the graph runs, for host work that should overlap with it.
+        captures: number of captured graphs.
+        most_particles: largest number of particles of a cloud so far.
+        most_moving: largest number of movable particles of a cloud so far.
+        most: largest geometry sizes of any simulated step so far, by (scenes, steps) of the encoded clouds.
     """
 
     def __init__(
@@ -132,33 +130,35 @@ class CapturedLoss:
 
     @property
     def needed(self) -> dict[str, Any]:
-        """``most_particles``, ``most_moving`` and ``most`` as plain JSON values."""
+        """``most_particles``, ``most_moving`` and ``most`` as JSON values, for :meth:`reserve`."""
         geometry = [[*map(list, clouds), list(sizes)] for clouds, sizes in self.most.items()]
         return {"rows": self.most_particles, "moving": self.most_moving, "geometry": geometry}
 
     def reserve(self, needed: dict[str, Any]) -> None:
-        """Graphs made from now on have capacity for what was ``needed`` in another run or process."""
+        """Reserves capacity for the sizes ``needed`` in another run or process in all later captures."""
         self.most_particles = max(self.most_particles, needed["rows"])
         self.most_moving = max(self.most_moving, needed.get("moving", 0))
         for scenes, times, sizes in needed["geometry"]:
             self.grow((tuple(scenes), tuple(times)), [tuple(sizes)])
 
     def grow(self, clouds: tuple, sizes: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
-        """``most`` of these clouds, which is at least all of ``sizes`` from now on."""
+        """Raises ``most`` of these clouds to at least all of ``sizes``, and returns it."""
         known = [self.most[clouds]] if clouds in self.most else []
         self.most[clouds] = tuple(map(max, zip(*sizes, *known, strict=True)))
         return self.most[clouds]
 
     def graph(self, step: _Step, function: Callable[[], Any]) -> Captured:
-        """The graph of ``step``. Where it does not fit into the GPU's memory those of other steps go, to be made anew
-        when needed, and from then on all share the memory of the largest.
+        """Captures the graph of ``step``.
+
+        If the GPU's memory is exhausted, the graphs of other steps are freed (and captured again when needed), and from
+        then on all graphs share one memory pool.
 
         Raises:
-            CaptureError: this one alone does not fit, or it cannot be captured.
+            CaptureError: the graph does not fit into memory alone, or cannot be captured.
         """
         device = self.parameters[0].device
         if self._pool is not None and all(other is step for other in self._steps.values()):
-            self._pool = torch.cuda.graph_pool_handle()  # memory whose graphs are all gone cannot be used again
+            self._pool = torch.cuda.graph_pool_handle()  # a pool cannot be reused after all its graphs are freed
         for is_last in (False, True):
             try:
                 return Captured(function, device, self._pool)
@@ -171,7 +171,7 @@ class CapturedLoss:
                         "and recompute: [encoder, steps]",
                         out_of_memory=True,
                     ) from error
-            # Not while the error is handled: it holds all that did not fit.
+            # Outside of the except block, because the error's traceback references the tensors to free.
             self._steps = {kind: other for kind, other in self._steps.items() if other is step}
             self._pool = torch.cuda.graph_pool_handle()
             gc.collect()
@@ -179,10 +179,10 @@ class CapturedLoss:
 
     @torch.no_grad()
     def prepare(self, batch: Batch) -> Prepared:
-        """Waits for the device; may be called while a graph runs.
+        """Counts the particles of a batch. Synchronises the device; may be called while a graph runs.
 
         Raises:
-            InputError, NumericalError: the encoder cannot read the batch.
+            InputError, NumericalError: the batch is not a valid input of the encoder.
         """
         context = batch.context
         n_clouds, (n_images, _, *size) = context.cloud_scene.shape[0], context.images.shape
@@ -195,28 +195,29 @@ class CapturedLoss:
         return Prepared(batch, tuple(counts), max(moving), self.simulator.encoder.static_shapes(context, max(counts)))
 
     def __call__(self, prepared: Prepared, weights: Tensor, report: StabilityReport) -> Gradients:
-        """Gradients are overwritten by the next call.
+        """Computes loss and gradients; the next call overwrites the gradients.
 
         Args:
-            weights: of the steps.
-            report: receives what the simulator's guards find; unusable particles of a rollout sleep.
+            prepared: the batch.
+            weights: [S], weight of each step.
+            report: counts invalid numbers; particles with invalid numbers are put to sleep during a rollout.
         """
         kind, largest = prepared.kind, max(prepared.counts)
         self.most_particles = max(self.most_particles, largest)
         self.most_moving = max(self.most_moving, prepared.moving)
         step = self._steps.pop(kind, None)
         if step is None or largest > step.particles or prepared.moving > step.moving:
-            step = None  # its memory goes back first
+            step = None  # frees its memory before the new capture
             while len(self._steps) >= MOST_KINDS:
                 del self._steps[next(iter(self._steps))]
             capacity = (_rounded_up(PARTICLES_FACTOR * most) for most in (self.most_particles, self.most_moving))
             step = _Step(self, *capacity, prepared, weights)
-        self._steps[kind] = step  # now the newest
+        self._steps[kind] = step  # most recently used
         return step(prepared, weights, report)
 
 
 class _Step:
-    """A step of one kind, with a capacity of ``particles`` a cloud, of which ``moving`` may move."""
+    """Graph of one kind of batch, for up to ``particles`` particles per cloud, of which ``moving`` are movable."""
 
     def __init__(self, owner: CapturedLoss, particles: int, moving: int, prepared: Prepared, weights: Tensor):
         self._owner, self._capacities, self._is_ready = owner, [], False
@@ -238,9 +239,9 @@ class _Step:
             numbers = found.tolist()
             if all([capacity.fits(found) for capacity, found in zip(self._capacities, numbers, strict=True)]):
                 break
-            self._graph = self._records = loss = errors = gradients = found = None  # their memory goes back first
+            self._graph = self._records = loss = errors = gradients = found = None  # frees memory before the capture
             grown = [c.grown(number, FACTOR) for c, number in zip(self._capacities, numbers, strict=True)]
-            observed = zip(grown, self._observed(), strict=True)  # behind what did not fit, found is of other particles
+            observed = zip(grown, self._observed(), strict=True)  # counts after an overflow are invalid
             self._grow([c.grown((0, *seen.sizes), 1) for c, seen in observed])
             self._capture()
             loss, errors, gradients, found, records = self._replay()
@@ -248,7 +249,7 @@ class _Step:
         return Gradients(loss, errors, gradients)
 
     def _grow(self, needed: Sequence[PyramidCapacity]) -> None:
-        """Capacity that was too small for one simulated step, of whatever kind, will soon be for others."""
+        """Grows the capacities of all kinds of batches, because one that was exceeded will soon be again."""
         if not needed:
             return
         most = self._owner.grow(self._clouds, [capacity.sizes for capacity in needed])
@@ -269,7 +270,7 @@ class _Step:
         report: StabilityReport,
         wrap: Callable[[Callable], Callable] | None = None,
     ) -> list[Particles]:
-        """The simulated steps; ``wrap`` as in Simulator.rollout."""
+        """Returns the simulated steps; ``wrap`` as in Simulator.rollout."""
         owner, plan = self._owner, self._owner.plan
         if not self._n_future:
             return []
@@ -299,7 +300,7 @@ class _Step:
             shown = {"plan": owner.plan, "report": report, "on_invalid": "drop"}
             draw = owner.again("images")(lambda p: owner.simulator._draw(p, self._targets.cameras, **shown).color)
             images = draw(particles)
-        report.close()  # what the backward pass computes again would be counted twice
+        report.close()  # recomputation in the backward pass must not count again
         loss, errors = owner.loss(images, self._targets, self._weights)
         once = [*owner.simulator.encoder.parameters(), *owner.simulator.renderer.parameters()]
         gradients = torch.autograd.grad(loss, [*once, *chain.from_iterable(of_calls)], allow_unused=True)
@@ -316,7 +317,7 @@ class _Step:
 
     @torch.no_grad()
     def _observed(self) -> list[PyramidCapacity]:
-        """What the geometry of each step needs, and some more."""
+        """Observes the geometry sizes of each step; returns capacities with a margin."""
         needed = []
 
         def geometry(history: Particles) -> Pyramid:
@@ -330,7 +331,7 @@ class _Step:
         return needed
 
     def _given(self, report: StabilityReport) -> tuple:
-        """With geometry of the sizes of this object."""
+        """Computes the step with geometry of the current capacities."""
         sizes, found = iter(self._capacities), []
 
         def geometry(history: Particles) -> Pyramid:
@@ -365,7 +366,7 @@ class _Step:
 
     @torch.no_grad()
     def _load(self, prepared: Prepared, weights: Tensor) -> None:
-        """Copies a batch to where the graph reads it."""
+        """Copies a batch into the static input tensors of the graph."""
         self._shapes.copy_(prepared.shapes)
         self._weights.copy_(weights)
         batch = prepared.batch
@@ -377,7 +378,7 @@ class _Step:
 
 
 class _OfCalls:
-    """``make`` of the geometry of calls: one that is computed again has that of before."""
+    """Caches the geometry of each call of the dynamics, so that recomputation in the backward pass reuses it."""
 
     def __init__(self, make: Callable[[Particles], Pyramid]):
         self._make, self._made, self._call = make, {}, 0
@@ -391,7 +392,7 @@ class _OfCalls:
         return self._made[self._call]
 
     def in_call(self, number: int, predict: Callable[[Particles], Particles]) -> Callable[[Particles], Particles]:
-        """``predict`` as call ``number``, from 1 on; what is outside of calls is made anew each time."""
+        """Wraps ``predict`` as call ``number`` (from 1); geometry made outside of calls is not cached."""
 
         def run(state: Particles) -> Particles:
             self._call = number
@@ -405,10 +406,10 @@ class _OfCalls:
 
 @contextmanager
 def _aliased(module: nn.Module) -> Iterator[list[Tensor]]:
-    """Within it the parameters of ``module`` are others in the same memory, in the order of ``parameters()``.
+    """Replaces the parameters of ``module`` by aliases of the same memory; yields them in order of ``parameters()``.
 
-    Calls that share weights would have the gradients of each weight added call by call, in thousands of small kernels;
-    those of aliases are added in one.
+    With shared parameters, autograd would add gradients call by call in thousands of small kernels; gradients of
+    aliases are added by a few multi-tensor kernels.
     """
     owners = [
         (part, name, value)
@@ -427,7 +428,7 @@ def _aliased(module: nn.Module) -> Iterator[list[Tensor]]:
 
 
 def _sums(by_call: Sequence[Sequence[Tensor | None]]) -> list[Tensor | None]:
-    """Sums over calls, in their order, of each of as many tensors; None: zero."""
+    """Sums lists of tensors over calls, in order; None counts as zero."""
     total = list(by_call[0])
     for call in by_call[1:]:
         both = [k for k, (a, b) in enumerate(zip(total, call, strict=True)) if a is not None and b is not None]
@@ -439,7 +440,7 @@ def _sums(by_call: Sequence[Sequence[Tensor | None]]) -> list[Tensor | None]:
 
 
 def _without_background(state: Particles) -> Particles:
-    """As if only what may move were there, in as many particles."""
+    """Puts all but movable particles to sleep with opacity 0, which keeps the number of particles."""
     left_out = state.activity != DYNAMIC
     opacities = torch.where(left_out, 0.0, state.opacities)
     return dataclasses.replace(state, activity=torch.where(left_out, ASLEEP, state.activity), opacities=opacities)

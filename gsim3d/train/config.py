@@ -1,4 +1,4 @@
-"""Settings of a training run. The attributes of each class are the keys of the YAML file that `gsim3d train` reads."""
+"""Configuration of a training run. Attributes of each class are the keys of the YAML file of `gsim3d train`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gsim3d.effects.plan import Plan
 from gsim3d.errors import InputError, check_ranges
 from gsim3d.io.settings import from_dict, to_dict, upgraded
 
-MANY = 10**9  # steps; more than any run has
+MANY = 10**9  # upper limit of step counts
 LARGEST_SIDE = 2**15  # pixels of an image
 DTYPES = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 
@@ -25,21 +25,21 @@ Precision = Literal["fp32", "bf16", "fp16"]
 
 @dataclass(frozen=True)
 class PhaseConfig:
-    """A part of the training with one kind of sample. Phases follow one another; the optimizer goes on through all.
+    """A phase of the training. Phases run one after another with the same optimizer state.
 
     Attributes:
-        steps: optimizer steps.
-        horizon: simulated steps after the encoded ones; 0 trains encoder and renderer alone. Longer ones teach longer
-            rollouts and cost time and memory in proportion.
-        cut: simulated steps that gradients flow back through at most: a longer horizon is simulated in segments, each
-            of which begins where the one before ended; 0: through all.
-        history: encoded steps; 0: as many as ``data.history``.
-        batch: scenes in an optimizer step, of all processes together.
-        target_views: images of each step that the loss compares.
-        begin_within: windows begin at one of so many first steps of a scene; 0: anywhere. Bodies at rest teach little.
-        from_start: share, 0 to 1, of the windows that begin at a scene's first step, whatever else is drawn.
-        learning_rate: peak, reached after ``warm_up`` of the phase's steps, then falling (one cycle a phase).
-        warm_up: share of the phase's steps, 0 to 1.
+        steps: number of optimizer steps.
+        horizon: number of simulated steps after the encoded ones; 0 trains encoder and renderer only. Time and memory
+            grow in proportion.
+        cut: largest number of simulated steps that gradients flow through; longer horizons are simulated in segments
+            without gradients between them. 0: all.
+        history: number of encoded steps; 0: ``data.history``.
+        batch: scenes per optimizer step, over all processes.
+        target_views: target images per step.
+        begin_within: windows start within so many first steps of a scene; 0: anywhere. Bodies at rest teach little.
+        from_start: fraction of the windows, 0 to 1, that start at a scene's first step.
+        learning_rate: peak learning rate of the phase's one-cycle schedule.
+        warm_up: fraction of the phase's steps, 0 to 1, until the peak.
     """
 
     steps: int
@@ -63,28 +63,27 @@ class PhaseConfig:
 
 @dataclass(frozen=True)
 class DataConfig:
-    """Which frames and views a sample shows.
+    """Frames and views of a sample.
 
     Attributes:
-        history: encoded steps (T of the paper).
-        shortest_history: every optimizer step draws its number of encoded steps from here to ``history``, so that one
-            model serves them all; 0: always ``history``. A phase with a history of its own keeps that.
-        context_views: input images of each step.
-        fewest_views: every optimizer step draws its number of input images from here to ``context_views``; 0: always
-            all.
-        context_cameras: the cameras they come from; empty: all but ``target_only_cameras``.
-        target_only_cameras: cameras that are never an input; the loss may compare them.
-        background_stride: pixels; of the pixels that show what never moves, every n-th row and column becomes
-            particles. Larger ones cost less and blur the background.
-        body_stride: the same, of the pixels that show what may move.
-        unfrozen_background: of every scene's background a share drawn from 0 to this one (0 to 1) is shown to the
-            dynamics as movable, by cubes, so that a model with an asymmetric background learns that particles at rest
-            may be awake or asleep.
-        resize: (width, height) pixels: images are scaled to cover it and cropped around the centre; empty: as recorded.
-        near_far: metres, the depth range of all scenes; empty: each scene's own.
-        targets_apart: targets come from cameras that are no input of their window. Else a model may learn to show each
-            input to its own camera only: particles right before it, too small for others to see.
-        unit_cameras: lengths are in units of the largest coordinate of a scene's cameras.
+        history: number of encoded steps (T of the paper).
+        shortest_history: if above 0, every optimizer step draws its number of encoded steps from this to ``history``,
+            so that the model supports all of them. A phase's own ``history`` takes precedence.
+        context_views: input images per step.
+        fewest_views: if above 0, every optimizer step draws its number of input images from this to ``context_views``.
+        context_cameras: input cameras; empty: all but ``target_only_cameras``.
+        target_only_cameras: cameras that are never an input, but may be a target.
+        background_stride: every n-th row and column of the pixels of static geometry becomes a particle. Larger values
+            are cheaper and blur the background.
+        body_stride: every n-th row and column of the pixels of movable bodies becomes a particle.
+        unfrozen_background: largest fraction, 0 to 1, of a scene's background that is presented to the dynamics as
+            movable, drawn per scene and in cubes; augmentation for models with an asymmetric background, whose
+            particles at rest may be awake or asleep.
+        resize: (width, height) in pixels: images are resized to cover it and centre-cropped; empty: as recorded.
+        near_far: depth range of all scenes in metres; empty: each scene's own.
+        targets_apart: draw targets only from cameras that are not an input of the window. Otherwise a model can overfit
+            to input views with tiny particles right in front of each camera.
+        unit_cameras: divide lengths by the largest coordinate of a scene's cameras.
     """
 
     history: int = 2
@@ -116,13 +115,13 @@ class DataConfig:
             wanted = f"must be [width, height], multiples of {SIZE_MULTIPLE} up to {LARGEST_SIDE}"
             raise InputError(f"data.resize: {wanted}; got {list(self.resize)}")
         if self.near_far and (len(self.near_far) != 2 or not 0 < self.near_far[0] < self.near_far[1]):
-            raise InputError(f"data.near_far: must be two rising distances above 0; got {list(self.near_far)}")
+            raise InputError(f"data.near_far: must be [near, far] with 0 < near < far; got {list(self.near_far)}")
         if set(self.context_cameras) & set(self.target_only_cameras):
             raise InputError("data: context_cameras and target_only_cameras share a camera")
 
     @property
     def fitting(self) -> Fitting:
-        """How scenes are to be opened."""
+        """Conversion with which scenes are opened."""
         return Fitting(self.resize or None, self.near_far or None, self.unit_cameras)
 
 
@@ -132,10 +131,10 @@ class LossConfig:
 
     Attributes:
         balance: weight of the first simulated step, 0 to 1; the encoded steps share the rest (lambda of the paper).
-        discount: weight of a simulated step relative to the one before it, 0 to 1 (gamma of the paper).
-        body_weight: extra weight of pixels that show a body that may move, relative to 1 of any other pixel.
-        perceptual: weight of LPIPS (VGG) beside the squared error, 0.05 in the paper and 0.01 for its rigid bodies; its
-            weights come with `gsim3d weights lpips`.
+        discount: weight of a simulated step relative to the previous one, 0 to 1 (gamma of the paper).
+        body_weight: weight added to pixels of movable bodies; other pixels have weight 1.
+        perceptual: weight of LPIPS (VGG), added to the squared error; 0.05 in the paper, 0.01 for its rigid bodies.
+            Install its weights with `gsim3d weights lpips`.
     """
 
     balance: float = 0.5
@@ -151,18 +150,18 @@ class LossConfig:
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """AdamW, clipped at a global gradient norm.
+    """AdamW with gradient clipping and weight averaging.
 
     Attributes:
-        beta1: decay of the averaged gradient, below 1.
-        beta2: decay of the averaged squared gradient, below 1.
-        eps: added to the root of the averaged square.
-        weight_decay: relative to the learning rate.
-        clip_norm: largest norm of all gradients together; 0: no clipping.
-        encoder_rate: learning rate of the encoder, relative to that of the other parts.
-        ema_decay: of the averaged weights, below 1; 0: no averaging. A step counts for the weights that it moves.
-        max_skipped: steps in a row whose loss or gradient is not finite, then the run stops. Lower ones stop at a rare
-            bad sample; higher ones only take longer to find that weights or data are beyond help.
+        beta1: decay of the first moment, below 1.
+        beta2: decay of the second moment, below 1.
+        eps: added to the root of the second moment.
+        weight_decay: decoupled weight decay, multiplied by the learning rate.
+        clip_norm: largest global gradient norm; 0: no clipping.
+        encoder_rate: learning rate of the encoder, relative to the other parts.
+        ema_decay: decay of the exponential moving average of the weights, below 1; 0: no average. Only weights that a
+            step updates are averaged in.
+        max_skipped: number of consecutive steps with a loss or gradient that is not finite, after which training stops.
     """
 
     beta1: float = 0.9
@@ -185,15 +184,15 @@ class OptimizerConfig:
 
 @dataclass(frozen=True)
 class PrecisionConfig:
-    """What matrix products, convolutions and attention of each part read: "fp32", "bf16" or "fp16".
+    """Input precision of matrix products, convolutions and attention: "fp32", "bf16" or "fp16".
 
     Weights, the residual stream, norms, positions, depths, curve codes, splats, losses, sums and the optimizer are
-    float32 throughout. With "fp16" anywhere the loss is scaled, see :class:`gsim3d.train.optimizer.LossScale`.
+    always float32. "fp16" enables loss scaling, see :class:`gsim3d.train.optimizer.LossScale`.
 
     Attributes:
-        encoder: of the encoder.
-        dynamics: of the dynamics.
-        renderer: of the renderer's head.
+        encoder: precision of the encoder.
+        dynamics: precision of the dynamics.
+        renderer: precision of the renderer's head.
     """
 
     encoder: Precision = "fp32"
@@ -202,11 +201,11 @@ class PrecisionConfig:
 
     @property
     def scales_loss(self) -> bool:
-        """Whether gradients could be too small for their numbers."""
+        """Whether the loss is scaled to keep float16 gradients from underflowing."""
         return "fp16" in (self.encoder, self.dynamics, self.renderer)
 
     def of(self, part: str, device: str) -> torch.autocast:
-        """A context in which ``part`` computes as configured, whatever context is around it."""
+        """Returns the autocast context of ``part``, independent of surrounding contexts."""
         dtype = DTYPES[getattr(self, part)]
         return torch.autocast(device, dtype, enabled=dtype != torch.float32)
 
@@ -216,26 +215,24 @@ class TrainConfig:
     """A training run.
 
     Attributes:
-        phases: run one after another.
-        preset: the model's sizes, a function of gsim3d.presets such as ``tiny``.
-        model: changes of the preset, nested like the model section of a checkpoint's config.yaml.
-        effects: what a scene calls for, as :class:`gsim3d.effects.spec.EffectsSpec` reads it.
+        phases: phases, run one after another.
+        preset: model sizes, a function of gsim3d.presets such as ``tiny``.
+        model: overrides of the preset, nested like the model section of a checkpoint's config.yaml.
+        effects: effects to simulate, see :class:`gsim3d.effects.spec.EffectsSpec`.
         data: frames and views of a sample.
         loss: weights of the loss.
-        optimizer: AdamW and averaging.
+        optimizer: AdamW and weight averaging.
         precision: "fp32", "bf16" or "fp16" for each part of the model.
-        recompute: parts of a step that the backward pass computes again instead of storing them, which saves memory and
-            changes no bit: "encoder", "steps" (all of a simulated step), "images". Beside "steps",
-            ``model.dynamics.checkpointing`` halves what one simulated step stores and costs another pass.
-        captured: on a GPU, steps run from CUDA graphs (gsim3d.train.captured): the same sums in fewer seconds where a
-            step has more small kernels than the host can launch. For models without drop path, shuffled curves and
-            batch normalisation; numbers differ from those without by rounding.
-        seed: all randomness follows from it and from the step.
-        workers: samples of a step that are computed at the same time, each on its share of the CPU threads; the numbers
-            are the same for any count above 0. 0: a step's samples form one batch, as GPUs and batch norm want it.
+        recompute: activation checkpointing of "encoder", "steps" (each simulated step) or "images"; saves memory with
+            equal results. ``model.dynamics.checkpointing`` additionally checkpoints the blocks within a step.
+        captured: on a GPU, run steps as CUDA graphs (gsim3d.train.captured); faster if kernel launches dominate. Not
+            supported with drop path, shuffled curves or batch normalisation. Results differ by rounding.
+        seed: seed of all randomness, together with the step.
+        workers: number of samples computed in parallel on shares of the CPU threads; results are equal for any number
+            above 0. 0: the samples of a step form one batch, as required by GPUs and batch normalisation.
         checkpoint_every: steps between checkpoints; the last step is always saved.
-        keep_checkpoints: older ones are removed.
-        log_every: steps between lines of the log.
+        keep_checkpoints: number of checkpoints to keep.
+        log_every: steps between log entries.
     """
 
     phases: tuple[PhaseConfig, ...] = (PhaseConfig(steps=1000), PhaseConfig(steps=4000, horizon=12))
@@ -261,15 +258,15 @@ class TrainConfig:
         check_ranges(self, seed=(0, 2**63 - 1), workers=(0, 10**4), keep_checkpoints=(1, MANY))
         check_ranges(self, checkpoint_every=(1, MANY), log_every=(1, MANY))
         if not self.phases:
-            raise InputError("phases: at least one is needed")
+            raise InputError("phases: must contain at least one phase")
 
     @property
     def n_steps(self) -> int:
-        """Optimizer steps of all phases."""
+        """Number of optimizer steps of all phases."""
         return sum(phase.steps for phase in self.phases)
 
     def phase_of(self, step: int) -> tuple[PhaseConfig, int]:
-        """The phase that optimizer step ``step`` belongs to, and the step's number in it."""
+        """Returns the phase of optimizer step ``step``, and the step's index in the phase."""
         for phase in self.phases:
             if step < phase.steps:
                 return phase, step
@@ -281,42 +278,40 @@ def _is_side(pixels: int) -> bool:
     return 1 <= pixels <= LARGEST_SIDE and pixels % SIZE_MULTIPLE == 0
 
 
-# May change between two runs of one folder without changing the curve; so may the number of workers, if there are any.
+# Settings that may change when a run is resumed, without changing the results up to rounding.
 FREE_SETTINGS = ("captured", "checkpoint_every", "keep_checkpoints", "log_every", "recompute")
-# May change as well, so that a run which diverged can go on; the curve is another one from there on.
+# Settings of sections that may change when a run is resumed, to recover a diverged run; they change the results.
 FREE_OF_SECTIONS = {"optimizer": ("clip_norm", "max_skipped"), "phases": ("learning_rate", "warm_up")}
 
 
 def check_settings(config: TrainConfig, dynamics: DynamicsConfig, plan: Plan, n_processes: int = 1) -> None:
-    """Raises InputError where settings do not go together, or do not fit the model or the number of processes."""
+    """Raises InputError if settings contradict each other, the model or the number of processes."""
     for history in {config.data.history, *(phase.history for phase in config.phases if phase.horizon)}:
         if history > plan.history:
-            raise InputError(f"data.history: {history} steps, but this model sees up to {plan.history}")
+            raise InputError(f"data.history: {history} steps, but this model takes at most {plan.history}")
     if config.data.unfrozen_background and not dynamics.is_asymmetric:
-        raise InputError(
-            'data.unfrozen_background: needs a model of background "asymmetric"; others do not know frozen particles'
-        )
+        raise InputError('data.unfrozen_background: requires a model with background "asymmetric"')
     if config.workers and dynamics.norm == "batch":
         raise InputError("workers: must be 0 for a model with batch normalisation, which needs all samples at once")
     if config.captured and config.workers:
-        raise InputError("captured: needs workers 0")
+        raise InputError("captured: requires workers: 0")
     if config.workers and n_processes > 1:
-        raise InputError(f"workers: must be 0 in {n_processes} processes, which share the samples of a step themselves")
+        raise InputError(f"workers: must be 0 with {n_processes} processes, which already share the samples of a step")
     for i, phase in enumerate(config.phases):
         if phase.batch < n_processes:
-            raise InputError(f"phases[{i}].batch: {phase.batch} samples are too few for {n_processes} processes")
+            raise InputError(f"phases[{i}].batch: must be at least the {n_processes} processes; got {phase.batch}")
 
 
 def check_same_run(config: TrainConfig, saved: dict, out: Path) -> None:
-    """Raises InputError where the run in ``out``, whose settings are ``saved``, was started with another ``config``."""
+    """Raises InputError if the run in ``out`` was started with settings ``saved`` that differ from ``config``."""
     before = _fixed(to_dict(from_dict(TrainConfig, upgraded(TrainConfig, saved), base=config)))
     for name, value in _fixed(to_dict(config)).items():
         if name not in FREE_SETTINGS and before[name] != value:
-            raise InputError(f"{out}: was started with another {name!r}; use the same or another folder")
+            raise InputError(f"{out}: was started with a different {name!r}; restore it, or use another folder")
 
 
 def _fixed(settings: dict) -> dict:
-    """A run's settings without those parts of its sections that may change."""
+    """Returns the settings of a run without those that may change within sections."""
     fixed = {**settings, "workers": bool(settings["workers"])}
     for name, free in FREE_OF_SECTIONS.items():
         sections = settings[name] if isinstance(settings[name], list) else [settings[name]]

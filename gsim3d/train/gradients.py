@@ -1,4 +1,4 @@
-"""Gradients of a training step: through long rollouts, with less memory, and what is known of them afterwards."""
+"""Gradients of a training step: truncated backpropagation, activation checkpointing, norms and statistics."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gsim3d.state import Particles
 def in_segments(
     rollout: Callable[[Particles, int], list[Particles]], state: Particles, n_steps: int, cut: int
 ) -> list[Particles]:
-    """``n_steps`` steps of ``rollout``; gradients flow back through ``cut`` of them at most, 0: through all."""
+    """Rolls out ``n_steps`` steps with truncated backpropagation: gradients flow through ``cut`` steps (0: all)."""
     steps = []
     while len(steps) < n_steps:
         segment = rollout(state, min(cut or n_steps, n_steps - len(steps)))
@@ -31,11 +31,11 @@ def in_segments(
 
 
 def recomputing(parts: Collection[str], module: nn.Module) -> Callable[..., Callable[[Callable], Callable]]:
-    """(part, generator) -> a decorator for functions that call ``module``, which does nothing but for ``parts``.
+    """Returns a function (part, generator) -> decorator that applies activation checkpointing to ``parts``.
 
-    What it decorates is computed again by the backward pass instead of being stored: less memory, the same bits.
-    Gradients reach the function's arguments and the module's parameters alike; the module's buffers, such as running
-    statistics, change in the first pass only; the generator is set back, so that both passes draw the same.
+    Decorated functions, which call ``module``, are recomputed in the backward pass, with equal bits. The module's
+    buffers, such as running statistics, change in the forward pass only; the generator is reset, so that both passes
+    draw equal random numbers. Functions of other parts are returned unchanged.
     """
 
     def choose(part: str, generator: torch.Generator | None = None) -> Callable[[Callable], Callable]:
@@ -54,7 +54,7 @@ def _recomputed(f: Callable, module: nn.Module, generator: torch.Generator | Non
             generator.set_state(before)
         return f(*arguments)
 
-    # Re-entrant checkpoints would drop the gradients of tensors inside particles.
+    # Reentrant checkpoints do not support gradients of tensors inside dataclasses.
     contexts = {"context_fn": lambda: (nullcontext(), _unchanged_buffers(module))}
     return checkpoint(run, *arguments, use_reentrant=False, preserve_rng_state=False, **contexts)
 
@@ -72,14 +72,14 @@ def _unchanged_buffers(module: nn.Module) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Seen:
-    """What was seen in one call of the loss, as plain values.
+    """Statistics of one call of the loss, as plain values.
 
     Attributes:
-        n_particles: that the encoder made.
-        n_clouds: in how many clouds.
-        n_unusable: findings of the report.
-        norms: of the gradients that reached each simulated step.
-        error: of a number that could not be used, or None.
+        n_particles: number of encoded particles.
+        n_clouds: number of encoded clouds.
+        n_unusable: number of findings in the report.
+        norms: gradient norm with respect to each simulated step.
+        error: message of an invalid number; None if all are valid.
     """
 
     n_particles: int = 0
@@ -90,11 +90,11 @@ class Seen:
 
 
 class StepWatch:
-    """Notes what happens in one call of the loss.
+    """Records statistics of one call of the loss.
 
     Attributes:
-        report: of that call.
-        strict: a particle that was dropped counts as a number that could not be used.
+        report: StabilityReport of the call.
+        strict: treat dropped particles as errors.
     """
 
     def __init__(self, *, strict: bool = False):
@@ -104,18 +104,22 @@ class StepWatch:
         self._squares: list[list[Tensor]] = []
 
     def count(self, n_particles: int, n_clouds: int) -> None:
-        """Notes how many particles the encoder made, and in how many clouds."""
+        """Records the number of encoded particles and clouds."""
         self._n_particles, self._n_clouds = n_particles, n_clouds
 
     def seen(self, scale: float | None) -> Seen:
-        """After the backward pass of a loss that was multiplied with ``scale``; None: without the gradients' norms."""
+        """Returns the statistics after the backward pass.
+
+        Args:
+            scale: factor of the loss; None: leave out gradient norms.
+        """
         wrong = ("error", "dropped") if self.strict else ("error",)
         error = next((str(finding.error()) for finding in self.report.findings if finding.action in wrong), None)
         norms = () if scale is None else tuple(norm / scale for norm in self.norms())
         return Seen(self._n_particles, self._n_clouds, self.report.total, norms, error)
 
     def follow(self, steps: Sequence[Particles]) -> None:
-        """Notes the gradients that will reach the particles of each step of a rollout."""
+        """Registers hooks that record the gradients of each step of a rollout."""
         self._squares = [[] for _ in steps]
         for squares, step in zip(self._squares, steps, strict=True):
             for value in step.row_fields().values():
@@ -123,7 +127,7 @@ class StepWatch:
                     value.register_hook(partial(_note, squares))
 
     def norms(self) -> list[float]:
-        """The norm of the gradient that reached each step's particles, first step first; after the backward pass."""
+        """Returns the gradient norm of each step's particles, after the backward pass."""
         return [math.sqrt(sum(square.item() for square in squares)) for squares in self._squares]
 
 
@@ -132,12 +136,12 @@ def _note(squares: list[Tensor], gradient: Tensor) -> None:
 
 
 def mean_of_norms(samples: Sequence[Sequence[float]]) -> list[float]:
-    """Norms for the mean of several losses, each of other samples, from the norms for each loss."""
+    """Combines gradient norms of several losses over disjoint samples into those of the mean loss."""
     return [math.sqrt(sum(norm**2 for norm in norms)) / len(samples) for norms in zip(*samples, strict=True)]
 
 
 def mean_of_samples(results: Sequence[tuple]) -> tuple[Tensor, Tensor, Sequence[Tensor | None]]:
-    """Means of (loss, errors, gradients), added in the order of the samples."""
+    """Averages (loss, errors, gradients) over samples, in a fixed order."""
     if len(results) == 1:
         return results[0]
     losses, errors, gradients = zip(*results, strict=True)
@@ -149,12 +153,12 @@ def mean_of_samples(results: Sequence[tuple]) -> tuple[Tensor, Tensor, Sequence[
 
 
 def total_norm(gradients: Iterable[Tensor | None]) -> Tensor:
-    """The norm of all gradients together."""
+    """Returns the global norm of all gradients."""
     return torch.nn.utils.get_total_norm([gradient for gradient in gradients if gradient is not None])
 
 
 def norms_by_module(gradients: Mapping[str, Tensor | None]) -> dict[str, float]:
-    """The norm of the gradients of all parameters of each part of a model, by the first word of their names."""
+    """Returns the gradient norm of each top-level module."""
     parts: dict[str, list[Tensor]] = {}
     for name, gradient in gradients.items():
         if gradient is not None:
@@ -164,7 +168,7 @@ def norms_by_module(gradients: Mapping[str, Tensor | None]) -> dict[str, float]:
 
 
 def first_not_finite(gradients: Iterable[tuple[str, Tensor | None]]) -> str | None:
-    """Name of the first parameter whose gradient is not finite."""
+    """Returns the name of the first parameter whose gradient is not finite; None if all are finite."""
     for name, gradient in gradients:
         if gradient is not None and not bool(gradient.isfinite().all()):
             return name

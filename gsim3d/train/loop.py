@@ -1,4 +1,4 @@
-"""The training loop. A step is a function of (weights, configuration, step): a resumed run repeats it bit for bit."""
+"""The training loop. A step depends only on (weights, configuration, step), so a resumed run has equal bits."""
 
 from __future__ import annotations
 
@@ -56,23 +56,24 @@ from gsim3d.train.restore import build_simulator, describe, keep_jacobian, model
 from gsim3d.train.samples import Batch, BatchReader, check_scenes, draw_batch, history_at, unfreeze
 from gsim3d.train.stopping import noted_signals
 
-EMA_WARM_UP = 10  # the average forgets its first values: its decay is at most (1 + step) / (10 + step)
+EMA_WARM_UP = 10  # the decay of the average is at most (1 + step) / (EMA_WARM_UP + step)
 
 
 class Trainer:
-    """One training run in a folder: weights, optimizer and averaged weights at some step.
+    """A training run in a folder; resumes from its last checkpoint if there is one.
 
     Args:
-        config: the run. A folder that already has a checkpoint must have been started with the same one.
-        scenes: to train on, in a fixed order. More may come when a run goes on, none may go.
-        out: run folder, made if absent.
-        device: "cpu" or "cuda". It may change when a run goes on; its numbers then change by rounding.
-        processes: those that train together, see :func:`gsim3d.train.processes.joined`; each has a Trainer of its own,
-            and the first one writes. Another number of them changes numbers by rounding, and what is drawn for drop
-            path and shuffled curves; batch normalisation counts the particles of all.
+        config: configuration; must equal that of a run to resume.
+        scenes: training scenes, in a fixed order. A resumed run may have more scenes, but not fewer.
+        out: run folder, created if absent.
+        device: "cpu" or "cuda". If it changes on resume, results change by rounding.
+        processes: processes that train together, see :func:`gsim3d.train.processes.joined`; each has its own Trainer,
+            and the first one writes. Their number changes results by rounding, and the random draws of drop path and
+            shuffled curves. Batch normalisation is synchronised.
+
     Attributes:
-        step: optimizer steps so far.
-        same_scenes: False where scenes have come since the last run, for then the curve goes on as another one.
+        step: number of completed optimizer steps.
+        same_scenes: False if scenes were added on resume, which changes the results.
     """
 
     def __init__(
@@ -136,20 +137,21 @@ class Trainer:
         watched: Scene | None = None,
         profile: bool = False,
     ) -> None:
-        """Trains to the end of the configuration, or to optimizer step ``until``, and saves there.
+        """Trains to the end of the configuration, or to optimizer step ``until``, and saves a checkpoint.
 
         Args:
-            until: optimizer step; None: the last one.
-            end: on the clock of time.monotonic; then it saves and stops. For one process.
+            until: optimizer step to stop after; None: the last one.
+            end: time of time.monotonic() at which to save and stop; for a single process.
             progress: show a progress bar.
             tensorboard: also log for TensorBoard, with a sample video at each checkpoint.
             wandb: also log for Weights & Biases.
             watch: called by the first process with a sample and the step, before the first step and at each checkpoint.
             watched: scene of that sample; None: the first one.
             profile: write a trace of two steps.
+
         Raises:
-            NumericalError: ``optimizer.max_skipped`` steps in a row were skipped; the message says what to do.
-            RunStopped: after SIGINT, SIGTERM or SIGUSR1, or without its launcher, it saved and ended before ``until``.
+            NumericalError: ``optimizer.max_skipped`` consecutive steps were skipped.
+            RunStopped: saved and stopped before ``until``, because of SIGINT, SIGTERM, SIGUSR1 or a lost launcher.
         """
         until = self.config.n_steps if until is None else min(until, self.config.n_steps)
         self.out.mkdir(parents=True, exist_ok=True)
@@ -173,7 +175,7 @@ class Trainer:
                 entry = self.train_step()
                 spent = time.perf_counter() - start
                 self.seconds += spent
-                if self.processes.count == 1:  # else all have agreed on it within the step
+                if self.processes.count == 1:  # otherwise agreed on within the step
                     self._stop = self._reason_to_stop()
                 machine = {"seconds": self.seconds, "step_seconds": spent, "memory_gib": memory_gib(self.device)}
                 if entry["step"] % self.config.log_every == 0 or "skipped" in entry or self.step == self.config.n_steps:
@@ -190,17 +192,17 @@ class Trainer:
                         self.log.board.video(sample_video(self.simulator, self.plan, self.draw_sample()), self.step)
                     if watch is not None:
                         watch(self.draw_sample(watched), self.step)
-        self.processes.check_same(weights=self.parameters.values())  # all wait until the first one has saved
+        self.processes.check_same(weights=self.parameters.values())  # also waits until the first process has saved
         if self._stop is not None and self.step < until:
             why, code = self._stop
             saved = f"step {self.step} of {self.config.n_steps} is saved in {self.out}"
-            raise RunStopped(f"{why}: {saved}; the same command goes on from there", code)
+            raise RunStopped(f"{why}: {saved}; run the same command to resume", code)
 
     def train_step(self) -> dict:
-        """One optimizer step; what to log of it.
+        """Performs one optimizer step; returns its log entry.
 
-        Where loss or gradient is not finite, or a number cannot be used, the step is skipped: weights, moments,
-        averages and statistics stay as they are.
+        The step is skipped if loss or gradient is not finite, or a number is invalid: weights, moments, averages and
+        running statistics stay unchanged.
         """
         phase, number = self.config.phase_of(self.step)
         rate = self.learning_rate(phase, number)
@@ -237,11 +239,11 @@ class Trainer:
         return {name: plain(value) for name, value in entry.items()}
 
     def learning_rate(self, phase: PhaseConfig, number: int) -> float:
-        """Of step ``number`` of a phase."""
+        """Returns the learning rate of step ``number`` of a phase."""
         return one_cycle(number, phase.steps, phase.learning_rate, phase.warm_up)
 
     def _check(self, entry: dict, loss: float, gradients: Sequence, norm: Tensor, seen: list[Seen]) -> str | None:
-        """Fills in ``entry``; why the gradients cannot be used, or None."""
+        """Fills in ``entry``; returns the reason why gradients are invalid, None if they are valid."""
         named = dict(zip(self.parameters, gradients, strict=True))
         if self._is_logged:
             entry["grad_norm_by_module"] = norms_by_module(named)
@@ -265,7 +267,7 @@ class Trainer:
         return self.step % self.config.log_every == 0
 
     def _reason_to_stop(self) -> tuple[str, int] | None:
-        """Why this process should save and end, and its exit code then."""
+        """Returns the reason to save and stop, with the exit code; None to continue."""
         if self._signals:
             return signal.Signals(self._signals[0]).name, 128 + self._signals[0]
         return (self.processes.lost, 2) if self.processes.lost else None
@@ -276,16 +278,16 @@ class Trainer:
         found = checkpoint.exists(self.out)
         good = f"its last checkpoint in {self.out}" if found else "its start: no checkpoint was written yet"
         raise NumericalError(
-            f"training: {self.n_skipped_in_a_row} steps in a row were skipped up to step {entry['step']}, "
+            f"training: {self.n_skipped_in_a_row} consecutive steps were skipped up to step {entry['step']}, "
             f"the last because {entry['skipped']}; lower phases.learning_rate or optimizer.clip_norm and train again: "
-            f"the run goes on from {good}",
+            f"the run resumes from {good}",
             step=entry["step"],
         )
 
     # ---- gradients of a batch, computed here, by threads, by processes or from a graph ----
 
     def _whole_batch(self, batch: int) -> tuple[float, Tensor, Sequence[Tensor | None], list[Seen]]:
-        """Loss, errors by step and gradients of the whole batch; what was seen in each share of it."""
+        """Returns loss, errors by step and gradients of the whole batch, and statistics of each share of it."""
         scale, samples = self.scale.value, self.processes.share(batch)
         norms_scale = scale if self._is_logged else None
         if self.processes.count > 1:
@@ -302,8 +304,12 @@ class Trainer:
     def _gradients(
         self, samples: list[int], watch: StepWatch | None = None, factor: float = 1.0
     ) -> tuple[Tensor, Tensor, Sequence[Tensor | None], StepWatch]:
-        """Loss, errors by step, the gradient of the loss for every parameter (None where it has no part), times the
-        scale and ``factor``, and what was seen on the way. Those of a CUDA graph are overwritten by the next call."""
+        """Computes the loss of ``samples`` and its gradients, multiplied by the loss scale and ``factor``.
+
+        Returns:
+            Loss, errors by step, gradient of each parameter (None if unused), and statistics. With CUDA graphs, the
+            next call overwrites the gradients.
+        """
         watch, factor = watch or StepWatch(), factor * self.scale.value
         if self.captured is not None:
             prepared = self._prepared(samples)
@@ -318,7 +324,7 @@ class Trainer:
         return self.captured.prepare(self._batch(samples))
 
     def _map(self, f: Callable, groups: list) -> list:
-        """f of every group, in order; with workers, several at a time, each with its share of the cores."""
+        """Maps ``f`` over groups, in parallel threads if there are workers, each with a share of the cores."""
         n_workers, n_threads = min(self.config.workers, len(groups), torch.get_num_threads()), torch.get_num_threads()
         if n_workers < 2:
             return [f(group) for group in groups]
@@ -329,11 +335,11 @@ class Trainer:
             torch.set_num_threads(n_threads)
 
     def _of_all_processes(self, samples: list[int], batch: int, norms_scale: float | None) -> tuple:
-        """Loss, errors, gradients and what was seen of all processes; this one computes ``samples``."""
-        # One that raises within a step leaves the others waiting: what cannot be used is dropped, and reported later.
+        """Returns loss, errors, gradients and statistics over all processes; this one computes ``samples``."""
+        # A process that raises within a step would block the others, so invalid numbers are dropped and reported later.
         drops = self.captured is None and self.simulator.config.stability.on_invalid == "raise"
         watch, share, count = StepWatch(strict=drops), len(samples) / batch, self.processes.count
-        try:  # a batch norm sums gradients over processes: each loss has its weight before
+        try:  # batch norms sum gradients over processes, so each loss is weighted before the backward pass
             loss, errors, gradients, _ = self._gradients(samples, watch, share * count)
             seen = watch.seen(norms_scale)
         except NumericalError as error:
@@ -347,7 +353,7 @@ class Trainer:
                 raise NumericalError(f"process {rank}: {of_process.error}")
         loss = sum(loss * share for loss, share in zip(losses, shares, strict=True))
         errors = sum(values * share for values, share in zip(errors, shares, strict=True))
-        gradients = [  # what has none in this process alone is 0
+        gradients = [  # parameters used in other processes only have gradient 0 here
             torch.zeros_like(parameter) if gradient is None and any(elsewhere) else gradient
             for parameter, gradient, elsewhere in zip(self.parameters.values(), gradients, zip(*known, strict=True))
         ]
@@ -363,18 +369,18 @@ class Trainer:
         return draw_batch(self.scenes, self.config.data, phase, self.config.seed, step, samples)
 
     def loss(self, batch: Batch, sample: int = 0, watch: StepWatch | None = None) -> tuple[Tensor, Tensor]:
-        """The loss of a batch, and each step's unweighted mean squared error; ``sample`` numbers the randomness."""
+        """Computes the loss of a batch and the unweighted mean squared error of each step; ``sample`` seeds noise."""
         images = self._images(batch, sample, watch or StepWatch())
         return self.loss_of_images(images, batch.targets, self.step_weights(batch))
 
     def step_weights(self, batch: Batch) -> Tensor:
-        """Weight of each step of a batch, on its device."""
+        """Returns the weight [S] of each step of a batch."""
         settings = self.config.loss
         weights = time_weights(batch.n_context, batch.n_future, balance=settings.balance, discount=settings.discount)
         return weights.to(self.device)
 
     def _images(self, batch: Batch, sample: int, watch: StepWatch) -> Tensor:
-        """What the target cameras of a batch should have seen; each part of the model in its precision."""
+        """Predicts the images of the target cameras of a batch, each part of the model in its precision."""
         simulator, precision = self.simulator, self.config.precision
         again = recomputing(self.config.recompute, simulator)
         options = {"report": watch.report, "on_invalid": "drop" if watch.strict else None}
@@ -386,7 +392,7 @@ class Trainer:
         watch.count(particles.n_rows, particles.n_clouds)
         if batch.n_future:
             if self.config.data.unfrozen_background:
-                rng = generator(self.config.seed, self.step, sample, "thawed")  # as the first versions named it
+                rng = generator(self.config.seed, self.step, sample, "thawed")  # name of older versions, kept for bits
                 particles = unfreeze(particles, self.config.data.unfrozen_background, self.effects, rng)
             with precision.of("dynamics", self.device):
                 begin = simulator._prepare(particles, self.plan)
@@ -398,7 +404,7 @@ class Trainer:
         draw = {"plan": self.plan, **options}
         with precision.of("renderer", self.device):
             images = again("images")(lambda p: simulator.render(p, batch.targets.cameras, **draw).color)(particles)
-        watch.report.close()  # what the backward pass computes again would be counted twice
+        watch.report.close()  # recomputation in the backward pass must not count again
         return images
 
     def draw_sample(self, scene: Scene | None = None) -> Sample:
@@ -409,7 +415,7 @@ class Trainer:
     # ---- checkpoints ----
 
     def save(self) -> Path | None:
-        """Writes a checkpoint of this step into the run folder; None where another process does."""
+        """Writes a checkpoint and returns its folder; None in all processes but the first."""
         if not self.processes.is_first:
             return None
         moments = {}
@@ -440,8 +446,8 @@ class Trainer:
         known = saved.state.get("scenes", names)
         if missing := sorted(set(known) - set(names)):
             raise InputError(
-                f"{self.out}: was trained on {len(missing)} scenes that are not given now, such as {missing[0]}; "
-                "give the same ones, or more, or use another folder"
+                f"{self.out}: was trained on {len(missing)} scenes that are missing now, such as {missing[0]}; "
+                "give the same scenes or more, or use another folder"
             )
         self.same_scenes = known == names
         try:

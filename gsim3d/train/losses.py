@@ -1,4 +1,4 @@
-"""The training loss: errors of images, weighted over time."""
+"""The training loss: image errors weighted over time."""
 
 from __future__ import annotations
 
@@ -9,20 +9,23 @@ from gsim3d.cameras import Frames
 from gsim3d.evaluate.perceptual.lpips import LPIPS
 from gsim3d.train.config import LossConfig
 
-LEAST_WEIGHT = 1e-12  # of an image's pixels together: one without any has an error of 0
+LEAST_WEIGHT = 1e-12  # lower bound of the total pixel weight of an image, so that empty images have error 0
 
 
 def training_loss(
     settings: LossConfig, perceptual: LPIPS | None, images: Tensor, targets: Frames, weights: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The loss, and each step's unweighted mean squared error.
+    """Computes the loss, and the unweighted mean squared error of each step.
 
     Args:
-        settings: weights of its terms.
-        perceptual: the network, where ``settings`` have a weight for it.
-        images: [I, H, W, 3], what the target cameras should have seen.
-        targets: what they saw; image i shows step ``image_cloud[i]`` modulo S.
-        weights: [S] of :func:`time_weights`.
+        settings: weights of the terms.
+        perceptual: LPIPS network, if ``settings.perceptual`` is not 0.
+        images: [I, H, W, 3], rendered images of the target cameras.
+        targets: ground truth; image i shows step ``image_cloud[i] % S``.
+        weights: [S], from :func:`time_weights`.
+
+    Returns:
+        Scalar loss and errors [S].
     """
     n_steps, truth, shown = weights.shape[0], targets.images.permute(0, 2, 3, 1), targets.dynamic
     weight = 1 + settings.body_weight * shown if settings.body_weight and shown is not None else None
@@ -39,16 +42,16 @@ def training_loss(
 
 
 def time_weights(n_past: int, n_future: int, *, balance: float = 0.5, discount: float = 0.87) -> Tensor:
-    """Weight of each step: ``(1 - balance) / n_past`` for encoded ones, ``balance * discount^j`` for simulated ones.
+    """Returns step weights: ``(1 - balance) / n_past`` for encoded, ``balance * discount^j`` for simulated steps.
 
-    Without simulated steps ``balance`` is 0: the loss is the plain mean over the encoded steps. The simulated part is
-    not normalised, so a longer rollout weighs more.
+    Without simulated steps the loss is the mean over the encoded steps. The simulated part is not normalised, so longer
+    rollouts have a larger total weight.
 
     Returns:
         float32 [n_past + n_future].
     """
     if n_past < 1 or n_future < 0:
-        raise ValueError(f"time_weights: n_past >= 1 and n_future >= 0 are needed; got {n_past}, {n_future}")
+        raise ValueError(f"time_weights: must have n_past >= 1 and n_future >= 0; got {n_past}, {n_future}")
     if n_future == 0:
         return torch.full((n_past,), 1 / n_past)
     past = torch.full((n_past,), (1 - balance) / n_past)
@@ -56,7 +59,7 @@ def time_weights(n_past: int, n_future: int, *, balance: float = 0.5, discount: 
 
 
 def image_errors(pred: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
-    """Mean squared error of each image [I] from [I, H, W, C]; ``weight`` [I, H, W] makes it a weighted mean."""
+    """Returns the mean squared error [I] of images [I, H, W, C], optionally weighted by ``weight`` [I, H, W]."""
     errors = (pred - target).square().mean(-1)
     if weight is None:
         return errors.mean((1, 2))
@@ -64,18 +67,18 @@ def image_errors(pred: Tensor, target: Tensor, weight: Tensor | None = None) -> 
 
 
 def mean_by_step(values: Tensor, step: Tensor, n_steps: int) -> Tensor:
-    """Means [n_steps] of the values [I] of each step [I] (int64); a product with a small matrix, so order is fixed."""
+    """Averages values [I] by step [I] (int64) to [n_steps]; a matrix product, so the order of sums is fixed."""
     member = (step[None] == torch.arange(n_steps, device=step.device)[:, None]).to(values.dtype)
     return (member * values).sum(1) / member.sum(1).clamp(min=1)
 
 
 def image_loss(errors: Tensor, step: Tensor, weights: Tensor) -> Tensor:
-    """``sum_t weights[t] * mean over images of step t`` of the errors of each image.
+    """Computes ``sum_t weights[t] * mean of errors at step t``.
 
     Args:
-        errors: [I].
-        step: int64 [I], the step that each image shows.
-        weights: [S] of :func:`time_weights`.
+        errors: [I], error of each image.
+        step: int64 [I], step of each image.
+        weights: [S], from :func:`time_weights`.
     """
     by_step = mean_by_step(errors, step, weights.shape[0])
     return (weights.to(by_step) * by_step).sum()

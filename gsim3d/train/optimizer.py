@@ -1,4 +1,4 @@
-"""AdamW for models of many small tensors, its learning rate, averaged weights, scaled losses, repeatable bits."""
+"""AdamW for many small tensors, learning-rate schedule, weight averaging, loss scaling and deterministic mode."""
 
 from __future__ import annotations
 
@@ -15,20 +15,21 @@ from gsim3d.io.checkpoint import laid_out_as
 from gsim3d.nn.layers import tf32_only_if_asked
 from gsim3d.train.config import OptimizerConfig
 
-START_DIVISOR = 25  # the first rate is the peak over this
-END_DIVISOR = 1e4  # the last rate is the first over this
+START_DIVISOR = 25  # initial learning rate = peak / START_DIVISOR
+END_DIVISOR = 1e4  # final learning rate = initial / END_DIVISOR
 FIRST_SCALE, LARGEST_SCALE = 2.0**16, 2.0**24
-STEPS_TO_DOUBLE = 2000  # good steps in a row; fewer: more skipped steps, more: small gradients stay zero for longer
+STEPS_TO_DOUBLE = 2000  # consecutive finite steps after which the loss scale doubles
 
 
 class Optimizer(torch.optim.AdamW):
-    """torch's AdamW, whose step is given its gradients and clips them at a global norm.
+    """AdamW with explicit gradients and clipping at a global norm.
 
-    On a GPU a step is some thirty launches of kernels that read many tensors each. torch's own step looks at tensor by
-    tensor in Python, and counts the steps of each on the host.
+    On a GPU an update takes about thirty multi-tensor kernels; torch's own step would loop over tensors in Python and
+    count steps on the host.
 
     Args:
-        parameters: by name; those of ``encoder.`` learn at ``settings.encoder_rate`` times the rate of a step.
+        parameters: parameters by name; the learning rate of ``encoder.`` is multiplied by ``settings.encoder_rate``.
+        settings: hyperparameters.
     """
 
     def __init__(self, parameters: Mapping[str, nn.Parameter], settings: OptimizerConfig):
@@ -47,12 +48,12 @@ class Optimizer(torch.optim.AdamW):
 
     @torch.no_grad()
     def update(self, gradients: Sequence[Tensor | None], norm: Tensor, rate: float) -> None:
-        """One step; ``gradients`` are clipped in place.
+        """Performs one update; clips ``gradients`` in place.
 
         Args:
-            gradients: of every parameter, in order; None where it had no part: it stays as it is.
-            norm: [], of all gradients together.
-            rate: the learning rate.
+            gradients: gradient of each parameter, in order; None leaves the parameter unchanged.
+            norm: scalar tensor, global norm of the gradients.
+            rate: learning rate.
         """
         for group in self.param_groups:
             group["lr"] = rate * group["factor"]
@@ -65,7 +66,7 @@ class Optimizer(torch.optim.AdamW):
         self.step()
 
     def restore(self, parameter: nn.Parameter, moments: Mapping[str, Tensor]) -> None:
-        """Goes on from saved "step", "exp_avg" and "exp_avg_sq" of ``parameter``."""
+        """Restores the saved "step", "exp_avg" and "exp_avg_sq" of ``parameter``."""
         self.state[parameter] = {
             kind: value.to(parameter.device) if kind == "step" else laid_out_as(parameter, value)
             for kind, value in moments.items()
@@ -89,7 +90,7 @@ class Optimizer(torch.optim.AdamW):
             settings |= {"weight_decay": group["weight_decay"], "amsgrad": False, "maximize": False}
             own = [known[parameter] for parameter in parameters]
             torch._fused_adamw_(parameters, own, means, squares, [], steps, **settings)
-        torch.autograd.graph.increment_version(list(known))  # which that call does not: rounded copies would stay
+        torch.autograd.graph.increment_version(list(known))  # not done by that call; autocast would keep stale casts
 
     def _begin(self, parameter: nn.Parameter) -> dict[str, Tensor]:
         state = self.state[parameter]
@@ -106,14 +107,14 @@ def update_average(
     gradients: Sequence[Tensor | None],
     decay: float,
 ) -> None:
-    """Moves ``average`` towards parameters that had a gradient and floating buffers; other buffers are copied.
+    """Updates an exponential moving average with updated parameters and floating buffers; copies other buffers.
 
     Args:
-        average: by name; changed in place.
-        parameters: by name.
-        buffers: by name.
-        gradients: of the parameters, in their order.
-        decay: of the average.
+        average: averages by name; changed in place.
+        parameters: parameters by name.
+        buffers: buffers by name.
+        gradients: gradients in the order of ``parameters``; parameters without one are not averaged.
+        decay: decay of the average.
     """
     pairs = zip(parameters.items(), gradients, strict=True)
     weights = {name: parameter for (name, parameter), gradient in pairs if gradient is not None}
@@ -125,11 +126,14 @@ def update_average(
 
 
 def one_cycle(step: int, n_steps: int, peak: float, warm_up: float = 0.01) -> float:
-    """One-cycle rate at ``step``: a cosine from peak / 25 up to the peak, then a cosine down to peak / 250 000.
+    """Returns the one-cycle learning rate: cosine from peak / 25 to the peak, then cosine to peak / 250 000.
 
     Args:
         step: from 0 to n_steps - 1.
-        warm_up: share of the steps until the peak.
+        n_steps: number of steps.
+        peak: peak learning rate.
+        warm_up: fraction of the steps until the peak.
+
     Source:
         Smith and Topin 2019, "Super-convergence".
     """
@@ -145,13 +149,13 @@ def _cosine(a: float, b: float, share: float) -> float:
 
 
 class LossScale:
-    """What the loss is multiplied with, and gradients divided by, so that float16 holds the gradients between.
+    """Dynamic loss scale, which keeps float16 gradients from underflowing.
 
-    Halved where a gradient is not finite, doubled after STEPS_TO_DOUBLE steps without.
+    Halved after a gradient that is not finite, doubled after STEPS_TO_DOUBLE consecutive finite steps.
 
     Attributes:
-        value: the factor.
-        n_good: steps since it changed.
+        value: factor of the loss.
+        n_good: finite steps since the last change.
     """
 
     def __init__(self, value: float = 1.0, n_good: int = 0):
@@ -168,13 +172,13 @@ class LossScale:
 
 @contextmanager
 def deterministic() -> Iterator[None]:
-    """Within it torch uses deterministic algorithms only, and TF32 only if asked."""
+    """Context in which torch uses deterministic algorithms only, and TF32 only if enabled explicitly."""
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
     before = torch.are_deterministic_algorithms_enabled()
     fill = torch.utils.deterministic.fill_uninitialized_memory
     cudnn = torch.backends.cudnn.deterministic, torch.backends.cudnn.benchmark
     torch.use_deterministic_algorithms(True)
-    torch.utils.deterministic.fill_uninitialized_memory = False  # costs time and changes no result of a correct op
+    torch.utils.deterministic.fill_uninitialized_memory = False  # a debugging aid that costs time
     torch.backends.cudnn.deterministic, torch.backends.cudnn.benchmark = True, False
     try:
         with tf32_only_if_asked():

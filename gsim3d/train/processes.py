@@ -1,4 +1,4 @@
-"""Training in several processes: which samples each computes, and what they exchange."""
+"""Distributed training: division of a batch among processes, and their communication."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from gsim3d.train.stopping import Liveness
 
 
 class Processes:
-    """The processes of one training run; each has a replica of the model and computes its share of every batch.
+    """The processes of a training run; each has a replica of the model and computes a share of every batch.
 
     Attributes:
-        rank: number of this one, from 0.
-        count: how many there are.
-        liveness: watches the others; None: nothing does.
+        rank: rank of this process.
+        count: number of processes.
+        liveness: monitor of the other processes; None for a single process.
     """
 
     def __init__(self, rank: int = 0, count: int = 1, liveness: Liveness | None = None):
@@ -32,21 +32,21 @@ class Processes:
 
     @property
     def lost(self) -> str | None:
-        """The launcher or process that is gone, as a sentence: save and end within half a minute; None while all are
-        there."""
+        """Message about a launcher or process that ended, after which this one must save and exit within half a minute;
+        None while all are alive."""
         return None if self.liveness is None else self.liveness.lost
 
     @property
     def is_first(self) -> bool:
-        """Whether this is the one that writes files and shows progress."""
+        """Whether this is the process that writes files and shows progress."""
         return self.rank == 0
 
     def share(self, batch: int) -> list[int]:
-        """The samples of a batch that this process computes: neighbours; counts differ by one at most."""
+        """Returns the contiguous samples of a batch for this process; counts differ by at most one."""
         return list(range(self.rank * batch // self.count, (self.rank + 1) * batch // self.count))
 
     def gather(self, value: Any) -> list[Any]:
-        """``value`` of every process, in the order of their ranks. Every process must call it."""
+        """Returns ``value`` of every process in order of rank. All processes must call it."""
         if self.count == 1:
             return [value]
         values = [None] * self.count
@@ -54,7 +54,7 @@ class Processes:
         return values
 
     def add(self, tensors: Sequence[Tensor | None], factor: float) -> list[Tensor | None]:
-        """Sums over all processes, each with its ``factor``, in one message; None must be None in all."""
+        """All-reduces the sum of ``factor * tensor`` in one message; None must be None in all processes."""
         known = [tensor for tensor in tensors if tensor is not None]
         flat = torch.cat([tensor.reshape(-1) for tensor in known]).mul_(factor)
         dist.all_reduce(flat)
@@ -62,27 +62,28 @@ class Processes:
         return [None if tensor is None else next(sums).view(tensor.shape) for tensor in tensors]
 
     def check_same(self, **tensors: Iterable[Tensor]) -> None:
-        """Raises InputError, in every process, where they do not hold the same bits."""
+        """Raises InputError, in every process, if tensors differ in any bit between processes."""
         if self.count > 1:
             self.check_agreement(**{name: _digest(values) for name, values in tensors.items()})
 
     def check_agreement(self, **values: Any) -> None:
-        """Raises InputError, in every process, where one of ``values`` is not the same in all of them."""
+        """Raises InputError, in every process, if one of ``values`` differs between processes."""
         first, *others = self.gather(values)
         for name in first:
             if any(other[name] != first[name] for other in others):
-                raise InputError(f"{name}: not the same in all processes of this run; do they see the same files?")
+                raise InputError(f"{name}: differs between the processes of this run; do they read the same files?")
 
 
 @contextmanager
 def joined(device: str) -> Iterator[Processes]:
-    """Within it the processes that torchrun started know each other; alone where none did.
+    """Context with the process group of torchrun, or a single process without it.
 
     Args:
-        device: "cpu" (gloo) or "cuda" (NCCL; each process takes the GPU of its local rank).
+        device: "cpu" (gloo) or "cuda" (NCCL; each process uses the GPU of its local rank).
+
     Raises:
-        RunStopped: another process is gone. Where that leaves this one waiting, it ends with the same line and exit
-            code 2 within a minute.
+        RunStopped: another process ended. If this process is blocked in communication, it prints the same message and
+            exits with code 2 within a minute.
     """
     count = int(os.environ.get("WORLD_SIZE", "1"))
     if count == 1:
@@ -95,21 +96,21 @@ def joined(device: str) -> Iterator[Processes]:
                 f"--nproc-per-node: process {local} of this node has no GPU; {torch.cuda.device_count()} found"
             )
         torch.cuda.set_device(local)
-    # Functions of this module keep the group that is there when it is imported (with DistributedDataParallel, for one).
-    # The group's threads would outlive it, and one that frees a tensor while Python ends aborts the process.
+    # This module keeps the group that exists when it is imported (by DistributedDataParallel, for example), whose
+    # threads could then abort the process at exit. So it is imported before a group exists.
     from torch.distributed.nn import functional  # noqa: F401
 
     rank = int(os.environ.get("RANK", "0"))
     liveness, failed = Liveness(rank), True
     try:
-        # Small Python values travel over gloo in both cases.
+        # Python objects are sent over gloo in both cases.
         dist.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo")
         processes = Processes(rank, count, liveness)
         liveness.connect(count, processes.gather)
         yield processes
         failed = False
-        dist.destroy_process_group()  # not after an error: others may wait for this process, and torchrun ends them
-    except RunStopped:  # all have agreed to end
+        dist.destroy_process_group()  # not after an error: others may be blocked, and torchrun terminates them
+    except RunStopped:  # all processes have agreed to stop
         failed = False
         dist.destroy_process_group()
         raise
@@ -123,7 +124,7 @@ def joined(device: str) -> Iterator[Processes]:
 
 
 def _exit_immediately() -> None:
-    """Else NCCL waits for the process that is gone, and threads of gloo abort this one while Python ends."""
+    """Exits without cleanup: NCCL would wait for the lost process, and gloo's threads would abort this one."""
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(2)

@@ -1,4 +1,4 @@
-"""From configurations and checkpoints to simulators."""
+"""Building of simulators from training configurations and checkpoints, and fitting of scenes to them."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ from gsim3d.pretrained import KEEP, loading
 from gsim3d.simulator import Simulator
 from gsim3d.train.config import DataConfig, TrainConfig
 
-SIMILAR = 1.25  # near and far are replaced by those of the training where they differ by at most this factor
+SIMILAR = 1.25  # scenes whose near and far differ by at most this factor use those of the training
 PRESETS = ("tiny", "small", "paper_latent", "paper_explicit")
 
 
 @dataclass(frozen=True)
 class Restored:
-    """A trained simulator and what it was trained for.
+    """A trained simulator with its training settings.
 
     Attributes:
-        simulator: ready to predict.
-        data: which frames and views it saw.
-        plan: what it computes: the effects it was trained with.
-        checkpoint: where it came from.
+        simulator: the simulator in evaluation mode.
+        data: data settings of the training.
+        plan: plan of the effects that it was trained with.
+        checkpoint: its checkpoint.
     """
 
     simulator: Simulator
@@ -49,37 +49,39 @@ class Restored:
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """(width, height) pixels of the training."""
+        """Image size of the training, (width, height) in pixels."""
         return tuple(self.simulator.inputs.image_size)
 
     @property
     def fps(self) -> float | None:
-        """Frames per second of the scenes it was trained on; None: the checkpoint does not say."""
+        """Frames per second of the training scenes; None if unknown."""
         return self.simulator.inputs.fps
 
     @property
     def n_encoded(self) -> int:
-        """Input steps: those of the training, or fewer where the simulator's setting says so."""
+        """Number of input steps: that of the training, or fewer if the simulator's setting reduces it."""
         return self.simulator.inputs.history
 
     @property
     def device(self) -> torch.device:
-        """Where the simulator's weights are, and where it predicts."""
+        """Device of the simulator."""
         return next(self.simulator.parameters()).device
 
     def open_scene(self, folder: str | Path, keep: Sequence[str] = (), resample: bool = False) -> Scene:
-        """The scene in ``folder`` as the model expects it; a :class:`gsim3d.errors.FitWarning` says what is changed.
+        """Opens a scene, fitted to the model; emits a :class:`gsim3d.errors.FitWarning` about changes.
 
         Args:
-            keep: parts of KEEP that stay as they are: "image", scaled into the model's size instead of cropped to it,
-                and "depth", near and far. Without it, near and far are those of the training where the scene's own
-                differ from them by at most a factor of SIMILAR: elsewhere the model sees less with them.
-            resample: take every k-th frame of a scene with k times the model's frame rate.
+            folder: scene folder.
+            keep: parts of KEEP to preserve: "image" scales images into the model's size instead of cropping them;
+                "depth" keeps the scene's near and far, which are otherwise replaced by those of the training if they
+                differ by at most a factor of SIMILAR.
+            resample: subsample the scene to the model's frame rate, which must divide its own.
+
         Raises:
-            InputError: as :meth:`check_scene` and the reader, or ``keep`` names another part.
+            InputError: as :meth:`check_scene` and the reader, or ``keep`` has an unknown part.
         """
         if unknown := [part for part in keep if part not in KEEP]:
-            raise InputError(f"keep must name parts of {', '.join(KEEP)}; got {unknown[0]!r}")
+            raise InputError(f"keep must contain only {', '.join(KEEP)}; got {unknown[0]!r}")
         exact = isinstance(self.simulator.config, ReleasedModelConfig)
         fitting = dataclasses.replace(
             self.data.fitting, slack=math.inf if exact else SIMILAR, enlarge=True, whole="image" in keep
@@ -87,51 +89,52 @@ class Restored:
         if "depth" in keep:
             fitting = dataclasses.replace(fitting, near_far=None)
         if resample and self.fps is None:
-            raise InputError("--resample: the checkpoint does not say at which frame rate it was trained")
+            raise InputError("--resample: the checkpoint does not contain the frame rate of its training")
         scene = Scene.open(folder, fitting=fitting, fps=self.fps if resample else None)
         self.check_scene(scene)
         if scene.recording.notes:
             warnings.warn(f"{folder}: {'; '.join(scene.recording.notes)}", FitWarning, stacklevel=2)
         if self.fps is None and scene.n_steps > 1:
-            said = "frame rate not checked: the checkpoint does not say at which one it was trained"
-            warnings.warn(said, FitWarning, stacklevel=2)
+            message = "frame rate not checked: the checkpoint does not contain that of its training"
+            warnings.warn(message, FitWarning, stacklevel=2)
         if changes := self._changes(scene):
             warnings.warn(f"fitted to the model: {'; '.join(changes)}", FitWarning, stacklevel=2)
         return scene
 
     def _changes(self, scene: Scene) -> list[str]:
-        """What fitting changed of a scene, in words."""
+        """Describes what fitting changed in a scene."""
         changes, (width, height) = [], self.image_size
         sizes = sorted(set(scene.recorded_sizes) - {self.image_size})
         if sizes and self.data.resize:
             recorded = ", ".join(f"{w}x{h}" for w, h in sizes)
             areas = [w * h * max(width / w, height / h) ** 2 for w, h in sizes]
             lost = 0.0 if scene.fitting.whole else max(0.0, 1 - width * height / max(areas))
-            cut = f", of which {lost:.0%} is cut off (--keep image keeps it)" if lost >= 0.005 else ""
+            cut = f", {lost:.0%} cropped (--keep image preserves it)" if lost >= 0.005 else ""
             changes.append(f"images of {recorded} pixels scaled to {width}x{height}{cut}")
         own = scene.own_depths
         if own is not None and (scene.near > own[0] or scene.far < own[1]):
             changes.append(
-                f"depths {own[0]:.3g} to {own[1]:.3g} replaced by {scene.near:.3g} to {scene.far:.3g}, those of the "
-                "training (--keep depth keeps them)"
+                f"depth range {own[0]:.3g} to {own[1]:.3g} replaced by that of the training, {scene.near:.3g} to "
+                f"{scene.far:.3g} (--keep depth preserves it)"
             )
         if scene.recording.subtract_background:
             changes.append(
-                'background subtracted and painted black ("masks": "none" in cameras.json keeps it, masks/ replaces it)'
+                'background subtracted and set to black (preserve it with "masks": "none" in cameras.json, or provide '
+                "masks/)"
             )
         return changes
 
     def check_scene(self, scene: Scene) -> None:
-        """Raises InputError where the scene's images, depths or frame rate are others than those of the training."""
+        """Raises InputError if the scene's image size, depth range or frame rate differs from the training's."""
         if (scene.width, scene.height) != self.image_size:
             raise InputError(
                 f"{scene.path}: images of {scene.width}x{scene.height} pixels; the model was trained on "
-                f"{self.image_size[0]}x{self.image_size[1]} (trained with data: {{resize: [W, H]}}, it would fit them)"
+                f"{self.image_size[0]}x{self.image_size[1]} (a model trained with data: {{resize: [W, H]}} fits them)"
             )
         fitted = scene.fitting.enlarge  # by open_scene, which chose the depths
         if self.data.near_far and not fitted and (scene.near, scene.far) != tuple(self.data.near_far):
             raise InputError(
-                f"{scene.path}: depths from {scene.near:g} to {scene.far:g}; the model was trained on "
+                f"{scene.path}: depth range {scene.near:g} to {scene.far:g}; the model was trained on "
                 f"{self.data.near_far[0]:g} to {self.data.near_far[1]:g}: open the scene with open_scene, which fits it"
             )
         self._check_rate(scene)
@@ -141,15 +144,14 @@ class Restored:
             return
         stride = frame_stride(scene.fps, self.fps)
         if stride != 1:
-            how = f"--resample, or open_scene(folder, resample=True), takes one frame in {stride}"
-            remedy = how if stride else "no whole multiple: resample the scene"
+            how = f"--resample, or open_scene(folder, resample=True), takes every frame number {stride}"
+            remedy = how if stride else "not an integer multiple: resample the scene"
             raise InputError(
                 f"{scene.path}: {scene.fps:g} frames per second; the model was trained at {self.fps:g} ({remedy})"
             )
 
     def data_of(self, scene: Scene) -> DataConfig:
-        """``data`` for a scene's cameras: numbers of cameras hold where the scene has them all, and there are at most
-        as many inputs as cameras."""
+        """Adapts ``data`` to a scene: drops camera indices if one does not exist, and limits the number of views."""
         data = self.data
         if max((*data.context_cameras, *data.target_only_cameras), default=-1) >= scene.n_cams:
             data = dataclasses.replace(data, context_cameras=(), target_only_cameras=())
@@ -158,7 +160,7 @@ class Restored:
 
 
 def model_config(config: TrainConfig) -> ModelConfig:
-    """The preset with the configuration's changes."""
+    """Returns the model configuration of a training: its preset with overrides."""
     if config.preset not in PRESETS:
         raise InputError(
             f"preset: must be one of {', '.join(PRESETS)}; got {shown(config.preset)}"
@@ -174,22 +176,23 @@ def model_config(config: TrainConfig) -> ModelConfig:
 
 
 def keep_jacobian(simulator: Simulator, saved: dict) -> None:
-    """``simulator`` draws as the run whose model section was ``saved``."""
+    """Sets the simulator's ``renderer.jacobian`` to that of a saved model section."""
     jacobian = current_model(saved)["renderer"]["jacobian"]
     renderer = dataclasses.replace(simulator.config.renderer, jacobian=jacobian)
     simulator.config = dataclasses.replace(simulator.config, renderer=renderer)
 
 
 def build_simulator(config: ModelConfig, seed: int) -> Simulator:
-    """A simulator whose first weights are a function of the seed; torch's own random state stays as it was.
+    """Builds a simulator with weights initialised from ``seed``; preserves torch's random state.
 
-    Raises InputError where ``config`` describes none.
+    Raises:
+        InputError: ``config`` is not a valid model.
     """
     return loading.build(simulator_class(config), config, seed)
 
 
 def describe(config: TrainConfig, model: ModelConfig, scene: Scene, effects: EffectsSpec) -> dict:
-    """The content of a checkpoint's config.yaml."""
+    """Returns the content of a checkpoint's config.yaml."""
     rate = {"fps": float(scene.fps)} if scene.n_steps > 1 else {}
     return {
         "model": to_dict(model),
@@ -200,10 +203,13 @@ def describe(config: TrainConfig, model: ModelConfig, scene: Scene, effects: Eff
 
 
 def restore(path: str | Path, device: str = "cpu", speed: str = "exact") -> Restored:
-    """:meth:`gsim3d.Simulator.from_pretrained`, also of the published model, with what it was trained for.
+    """Loads a simulator, also of the published model, with its training settings.
+
+    Args:
+        path, device, speed: see :meth:`gsim3d.Simulator.from_pretrained`.
 
     Raises:
-        InputError: as there, or the training's data settings are not of this version.
+        InputError: as :meth:`gsim3d.Simulator.from_pretrained`, or the data settings are not valid in this version.
     """
     simulator, saved = loading.load((Simulator, ReleasedSimulator), path, device, speed)
     data = {key: value for key, value in current_data(saved.config["data"]).items() if key not in ("image_size", "fps")}

@@ -1,4 +1,4 @@
-"""What ``gsim3d train`` does: a training run of one or several processes, from its last checkpoint to its end."""
+"""Implementation of ``gsim3d train``: starts or resumes a training run of one or several processes."""
 
 from __future__ import annotations
 
@@ -37,31 +37,33 @@ def train(
     """Trains on the scenes in ``folders`` and writes the run folder ``out``.
 
     Args:
-        cache: folder for decoded images; None: they stay in memory.
+        config: the training.
+        folders: scene folders.
+        out: run folder.
+        cache: folder to cache decoded images in; None caches them in memory.
         device: "cpu" or "cuda".
         until: optimizer step to stop after; None: the last one.
-        export: .safetensors file for the result; None: none.
+        export: .safetensors file to export the result to; None: no export.
         tensorboard: also log to OUT/tensorboard.
         wandb: also log for Weights & Biases.
         viewer: opens what is to be called with samples, see :meth:`gsim3d.train.loop.Trainer.run`.
         held_out: scenes that are not trained on; the viewer shows the first, or without any one of ``folders``.
         profile: write a trace of two steps to OUT/profile.
+
     Raises:
-        InputError: scenes do not fit the settings, or the memory is full.
-        RunStopped: a signal, or another process, ended the run.
+        InputError: scenes do not fit the settings, or memory is exhausted.
+        RunStopped: a signal, or the end of another process, stopped the run.
     """
     if cache:
-        Path(cache).mkdir(parents=True, exist_ok=True)  # fails before work begins
+        Path(cache).mkdir(parents=True, exist_ok=True)  # raises early if not writable
     scenes = [Scene.open(folder, cache_dir=cache, fitting=config.data.fitting) for folder in folders]
     Path(out).mkdir(parents=True, exist_ok=True)
     with joined(device) as processes, only_one_writer(Path(out)) if processes.is_first else nullcontext():
         report = print if processes.is_first else lambda *_: None
         trainer = Trainer(config, scenes, out, device=device, processes=processes)
         if trainer.step:
-            changed = (
-                "" if trainer.same_scenes else "; its scenes have changed, so the curve is another one from here on"
-            )
-            report(f"going on from step {trainer.step} of {config.n_steps}{changed}")
+            changed = "" if trainer.same_scenes else "; scenes were added, so results differ from an uninterrupted run"
+            report(f"resuming at step {trainer.step} of {config.n_steps}{changed}")
         watched = None
         if viewer and held_out:
             watched = Scene.open(held_out[0], cache_dir=cache, fitting=config.data.fitting)
@@ -74,8 +76,8 @@ def train(
             if not is_out_of_memory(error):
                 raise
             raise InputError(
-                f"step {trainer.step}: out of memory ({device}): a smaller batch or fewer target_views, larger strides "
-                f"of data, or recompute: [encoder, steps, images] need less; {out} goes on from its last checkpoint"
+                f"step {trainer.step}: out of memory ({device}): reduce batch or target_views, increase the strides of "
+                f"data, or set recompute: [encoder, steps, images]; then {out} resumes from its last checkpoint"
             ) from None
         report(f"trained to step {trainer.step} of {config.n_steps}: {out}")
         if export and processes.is_first:

@@ -1,4 +1,4 @@
-"""What a training step sees: windows of scenes, their input images and the images that the loss compares."""
+"""Training samples: windows of scenes with their input and target images."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from gsim3d.errors import InputError
 from gsim3d.state import DYNAMIC, FROZEN, Particles
 from gsim3d.train.config import DataConfig, PhaseConfig
 
-READERS = 2  # threads that read batches; so many steps are read ahead
+READERS = 2  # threads that read batches, and number of batches read ahead
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Windows of B scenes, all of n_context + n_future steps.
+    """Windows of B scenes, each of n_context + n_future steps.
 
     Attributes:
-        context: input images of the first n_context steps of each.
-        targets: images of all steps; image i shows cloud b * (n_context + n_future) + t.
-        n_context: encoded steps.
-        n_future: simulated steps.
-        cut: of :class:`gsim3d.train.config.PhaseConfig`.
+        context: input images of the first n_context steps of each window.
+        targets: target images of all steps; image i shows cloud b * (n_context + n_future) + t.
+        n_context: number of encoded steps.
+        n_future: number of simulated steps.
+        cut: see :class:`gsim3d.train.config.PhaseConfig`.
     """
 
     context: Frames
@@ -44,16 +44,16 @@ class Batch:
         return dataclasses.replace(self, context=self.context.to(device), targets=self.targets.to(device))
 
     def target_step(self) -> Tensor:
-        """int64 [I], the step in its window that each target image shows."""
+        """Returns int64 [I], the step in its window of each target image."""
         return self.targets.cameras.image_cloud % (self.n_context + self.n_future)
 
 
 class BatchReader:
-    """Batches of the steps of a run, those of the next steps read meanwhile.
+    """Reads the batches of a run, prefetching those of the next steps.
 
     Args:
-        draw: (step, samples) -> batch, a function of these alone; called in other threads.
-        n_steps: of the run.
+        draw: function (step, samples) -> batch; deterministic, called in other threads.
+        n_steps: number of steps of the run.
     """
 
     def __init__(self, draw: Callable[[int, tuple[int, ...]], Batch], n_steps: int):
@@ -65,7 +65,7 @@ class BatchReader:
         now, *later = ((number, tuple(samples)) for number in range(step, step + 1 + READERS))
         known = self._ahead.pop(now, None)
         for key in list(self._ahead):
-            if key[0] < step:  # read in vain: the next phase has other batches
+            if key[0] < step:  # prefetched, but not used: the next phase has other samples
                 self._ahead.pop(key, None)
         for key in later:
             if key[0] < self._n_steps and key not in self._ahead:
@@ -74,7 +74,7 @@ class BatchReader:
 
 
 def check_scenes(scenes: Sequence[Scene], data: DataConfig, phases: Sequence[PhaseConfig]) -> None:
-    """Raises InputError, naming the scene, where windows or views of a phase do not fit."""
+    """Raises InputError if a scene has too few steps or cameras for a phase, or differs from the others."""
     if not scenes:
         raise InputError("there is no scene to train on")
     for scene in scenes:
@@ -82,11 +82,11 @@ def check_scenes(scenes: Sequence[Scene], data: DataConfig, phases: Sequence[Pha
         if (scene.width, scene.height) != (first.width, first.height):
             raise InputError(
                 f"{scene.path}: images of {scene.width}x{scene.height} pixels, those of {first.path} have "
-                f"{first.width}x{first.height}; data.resize brings all to one size"
+                f"{first.width}x{first.height}; set data.resize"
             )
         if frame_stride(scene.fps, first.fps) != 1 and min(scene.n_steps, first.n_steps) > 1:
             raise InputError(
-                f"{scene.path}: {scene.fps:g} frames per second, {first.path} has {first.fps:g}; a model has one rate"
+                f"{scene.path}: {scene.fps:g} frames per second, {first.path} has {first.fps:g}; rates must be equal"
             )
         for phase in phases:
             n_steps = (phase.history or data.history) + phase.horizon
@@ -99,7 +99,7 @@ def check_scenes(scenes: Sequence[Scene], data: DataConfig, phases: Sequence[Pha
 
 
 def context_cameras(scene: Scene, data: DataConfig) -> list[int]:
-    """Cameras whose images may be an input, ascending."""
+    """Returns the allowed input cameras, ascending."""
     allowed = data.context_cameras or range(scene.n_cams)
     for name in ("context_cameras", "target_only_cameras"):
         if bad := [cam for cam in getattr(data, name) or () if not 0 <= cam < scene.n_cams]:
@@ -112,10 +112,10 @@ def context_cameras(scene: Scene, data: DataConfig) -> list[int]:
 def draw_batch(
     scenes: Sequence[Scene], data: DataConfig, phase: PhaseConfig, seed: int, step: int, samples: Sequence[int]
 ) -> Batch:
-    """Samples number ``samples`` of optimizer step ``step``: functions of (seed, step, sample) only.
+    """Draws ``samples`` of optimizer step ``step``; each depends on (seed, step, sample) only.
 
-    Context views are spread evenly around the list of allowed cameras, turned at random, the same at all steps of a
-    window; target views are any cameras, drawn afresh at every step.
+    Context views are evenly spaced in the list of allowed cameras, with a random offset, and equal at all steps of a
+    window; target views are drawn from all cameras at every step.
     """
     windows = draw_windows(scenes, data, phase, seed, step, samples)
     n_context, chosen = windows[0].n_context, [window.scene for window in windows]
@@ -129,19 +129,19 @@ def draw_batch(
 def draw_windows(
     scenes: Sequence[Scene], data: DataConfig, phase: PhaseConfig, seed: int, step: int, samples: Sequence[int]
 ) -> list[Window]:
-    """What :func:`draw_batch` shows of which scene; of ``scenes`` only the numbers of steps and cameras are read."""
+    """Draws the windows of :func:`draw_batch`; reads only the numbers of steps and cameras of ``scenes``."""
     n_context = history_at(data, phase, seed, step)
     data = dataclasses.replace(data, context_views=_drawn(data.fewest_views, data.context_views, seed, step, "views"))
     return [_draw_window(scenes, data, phase, n_context, seed, step, sample) for sample in samples]
 
 
 def history_at(data: DataConfig, phase: PhaseConfig, seed: int, step: int) -> int:
-    """Encoded steps of all samples of an optimizer step."""
+    """Returns the number of encoded steps of an optimizer step."""
     return phase.history or _drawn(data.shortest_history, data.history, seed, step, "history")
 
 
 def _drawn(least: int, most: int, seed: int, step: int, purpose: str) -> int:
-    """Any whole number from ``least`` to ``most``, the same for all samples of a step; ``most`` where least is 0."""
+    """Draws an integer from ``least`` to ``most``, equal for all samples of a step; ``most`` if least is 0."""
     return int(generator(seed, step, 0, f"number of {purpose}").integers(least, most + 1)) if least else most
 
 
@@ -166,27 +166,27 @@ def _draw_window(
 
 
 def spread_views(cameras: Sequence[int], count: int, turn: int) -> tuple[int, ...]:
-    """``count`` of ``cameras``, evenly spread around the list, shifted by ``turn`` in it."""
+    """Returns ``count`` of ``cameras``, evenly spaced in the circular list from index ``turn``."""
     n = len(cameras)
     return tuple(sorted(cameras[(turn + k * n // count) % n] for k in range(count)))
 
 
 def subsampled(frames: Frames, data: DataConfig) -> Frames:
-    """``frames`` of which those pixels become particles that the strides of ``data`` retain."""
+    """Returns ``frames`` with masks subsampled by the strides of ``data``."""
     return frames.subsample(data.background_stride, data.body_stride)
 
 
 def unfreeze(particles: Particles, most: float, spec: EffectsSpec, rng: np.random.Generator) -> Particles:
-    """``particles`` of which a random share of the background, up to ``most``, is not frozen but only at rest.
+    """Makes a random fraction of the frozen background movable (an augmentation).
 
-    Each scene draws its share; space is cut into cubes, and all frozen particles of a cube, at every step, become
-    movable, or none.
+    Each scene draws its fraction; space is divided into cubes, and either all or none of the frozen particles of a cube
+    become movable, at all steps.
 
     Args:
-        particles: of some scenes.
-        most: 0 to 1.
-        spec: whose rule of sleep says how large cubes are; without one, that of a new rule.
-        rng: is drawn from as often as there are scenes and cubes, whatever particles there are.
+        particles: particles of one or more scenes.
+        most: largest fraction, 0 to 1.
+        spec: its sleep rule, or the default one, gives the edge length of cubes.
+        rng: random generator; one draw per scene and per cube.
     """
     edge = (spec.dynamics.sleep or Sleep()).halo
     scene = particles.cloud_scene[particles.row_cloud()]

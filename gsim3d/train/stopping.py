@@ -1,6 +1,6 @@
-"""Why a training run ends before its last step: signals, and processes or a launcher that are gone.
+"""Early end of a training run: signals, and loss of the launcher or of a process.
 
-Processes of a run exchange signs of life; where the launcher or one of them is gone, the others end, too.
+Processes of a run exchange heartbeats; if the launcher or a process is lost, the others exit.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from types import FrameType
 from gsim3d.errors import RunStopped
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
-TWICE = 2.0  # seconds: a launcher passes on what its processes also got themselves
-INTERVAL = 2.0  # seconds between two signs of life
-SILENCE = 40.0  # seconds without one after which a process is gone; one that loads a library gives none meanwhile
-GRACE = 45.0  # seconds in which a run without a launcher may save and end by itself
+TWICE = 2.0  # seconds; a signal repeated within them is one that the launcher forwards
+INTERVAL = 2.0  # seconds between heartbeats
+SILENCE = 40.0  # seconds without heartbeat after which a process is lost; loading a library can block it for long
+GRACE = 45.0  # seconds in which a run without a launcher may save and exit by itself
 
-_MESSAGE = struct.Struct("!i")  # one of these two, or the rank of a process that is gone
+_MESSAGE = struct.Struct("!i")  # one of the two below, or the rank of a lost process
 _ALIVE, _LEFT = -1, -2
 
 
 @contextmanager
 def noted_signals() -> Iterator[list[int]]:
-    """Within it SIGINT, SIGTERM and SIGUSR1 end nothing: their numbers are in the list, the first one first.
+    """Context that records SIGINT, SIGTERM and SIGUSR1 in the yielded list instead of ending the process.
 
-    A second SIGINT raises KeyboardInterrupt. In other threads than the main one the list stays empty.
+    A second SIGINT raises KeyboardInterrupt. Outside of the main thread nothing is recorded.
     """
     noted: list[int] = []
     if threading.current_thread() is not threading.main_thread():
@@ -45,8 +45,8 @@ def noted_signals() -> Iterator[list[int]]:
         nonlocal first
         if not noted:
             first = time.monotonic()
-            text = f"\ngsim3d: {signal.Signals(number).name}: ends after this step, with a checkpoint\n"
-            os.write(2, text.encode())  # print may be in use
+            text = f"\ngsim3d: {signal.Signals(number).name}: stopping after this step, with a checkpoint\n"
+            os.write(2, text.encode())  # print is not reentrant
         elif number == signal.SIGINT and time.monotonic() - first > TWICE:
             raise KeyboardInterrupt
         noted.append(number)
@@ -60,19 +60,19 @@ def noted_signals() -> Iterator[list[int]]:
 
 
 class Liveness:
-    """Watches the launcher of this process and, over connections to the first process, all others.
+    """Monitors the launcher of this process and, through connections to the first process, all other processes.
 
-    An operation between processes waits for minutes, or for ever, where one is gone, and cannot be interrupted. So a
-    thread ends this process with one line and exit code 2 where it has not ended by itself soon after.
+    Communication with a lost process blocks for minutes or forever, and cannot be interrupted. So if this process does
+    not exit by itself soon after a loss, a thread prints a message and exits with code 2.
 
     Attributes:
-        lost: what is gone, a sentence; None while all are there.
+        lost: message about what was lost; None while all are alive.
     """
 
     def __init__(self, rank: int):
         self.lost: str | None = None
         self._rank = rank
-        # A process that was started by hand may outlive its shell.
+        # Without torchrun, the parent is a shell, which the process may outlive.
         self._launcher = os.getppid() if "TORCHELASTIC_RUN_ID" in os.environ else None
         self._over, self._found = threading.Event(), threading.Event()
         self._others: dict[int, socket.socket] = {}
@@ -80,7 +80,7 @@ class Liveness:
         threading.Thread(target=self._watch, daemon=True).start()
 
     def connect(self, count: int, gather: Callable) -> None:
-        """Connects ``count`` processes, whose ``gather`` works already."""
+        """Connects ``count`` processes; ``gather`` exchanges values between them."""
         try:
             others = self._accepted(count, gather) if self._rank == 0 else self._connected(gather)
         except OSError as error:
@@ -109,16 +109,16 @@ class Liveness:
         return {0: first}
 
     def end(self, *, failed: bool) -> None:
-        """Ends the watch; ``failed``: the others cannot go on without this process."""
+        """Stops monitoring; ``failed`` informs the others that this process is lost."""
         if not self._over.is_set():
             self._over.set()
             self._send(self._rank if failed else _LEFT)
 
     def error(self) -> RunStopped:
-        """What to raise where an operation between processes failed."""
+        """Returns the error to raise after failed communication."""
         self._found.wait(INTERVAL)
-        what = self.lost or "the connection to another process of this run broke"
-        return RunStopped(f"{what}; start the command again: a training run goes on from its last checkpoint")
+        what = self.lost or "the connection to another process of this run was lost"
+        return RunStopped(f"{what}; run the command again to resume from the last checkpoint")
 
     def _watch(self) -> None:
         while not self._over.is_set():
@@ -131,7 +131,7 @@ class Liveness:
                 return self._lose(f"process {gone} of this run has ended or does not answer", INTERVAL)
 
     def _listen(self, until: float) -> int | None:
-        """The rank of a process that is gone, after listening for a while; None: all are there."""
+        """Listens for heartbeats; returns the rank of a lost process, None if all are alive."""
         with selectors.DefaultSelector() as selector:
             for rank in self._heard:
                 selector.register(self._others[rank], selectors.EVENT_READ, rank)
@@ -153,7 +153,7 @@ class Liveness:
         for other in self._others.values():
             try:
                 other.send(_MESSAGE.pack(message))
-            except OSError:  # what reads from it notices
+            except OSError:  # noticed when reading
                 pass
 
     def _lose(self, what: str, grace: float) -> None:
@@ -165,7 +165,7 @@ class Liveness:
 
 
 def _received(other: socket.socket) -> int | None:
-    """A message; None where the connection has ended."""
+    """Receives a message; returns None if the connection was closed."""
     try:
         return _MESSAGE.unpack(other.recv(_MESSAGE.size, socket.MSG_WAITALL))[0]
     except (OSError, struct.error):

@@ -68,7 +68,7 @@ def test_train_writes_checkpoint_log_and_export(capsys, work):
     lines = (work / "run" / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(line)["step"] for line in lines] == [0, 1]
     code, out, _ = call(capsys, "train", work / "train.yaml", "--data", work / "data", "--out", work / "run")
-    assert code == 0 and "going on from step 2 of 2" in out
+    assert code == 0 and "resuming at step 2 of 2" in out
 
 
 def test_train_with_decoded_files_learns_the_same(capsys, work, tmp_path):
@@ -176,7 +176,7 @@ BAD = {
     "no configuration": (["train", "--data", "{data}", "--out", "{new}"], "CONFIG is needed"),
     "configuration is missing": (["train", "no.yaml", "--data", "{data}", "--out", "{new}"], "no.yaml cannot be read"),
     "data is missing": (["train", "{config}", "--data", "{new}/data", "--out", "{new}"], "data"),
-    "no scene": (["train", "{config}", "--data", "{empty}", "--out", "{new}"], "holds no scene"),
+    "no scene": (["train", "{config}", "--data", "{empty}", "--out", "{new}"], "contains no scene"),
     "bad step": (["train", "{config}", "--data", "{data}", "--out", "{new}", "--until", "0"], "--until"),
     "bad export": (["train", "{config}", "--data", "{data}", "--out", "{new}", "--export", "a.pt"], "--export"),
     "out is a file": (["train", "{config}", "--data", "{data}", "--out", "{config}"], "train.yaml"),

@@ -76,7 +76,7 @@ def test_stopped_in_the_middle_it_goes_on(finished, tmp_path, capsys):
     scenes = [Scene.open(path) for path in split_scenes(find_scenes(out / "data"))[0]]
     Trainer(config.train, scenes, tmp_path / "model").run(until=3, progress=False)
     resumed = run_demo(tmp_path, config, progress=False)
-    assert "going on from step 3" in capsys.readouterr().out
+    assert "resuming at step 3" in capsys.readouterr().out
     weights, expected = (checkpoint.load(folder / "model").weights for folder in (tmp_path, out))
     assert all((weights[name] == expected[name]).all() for name in expected)
     assert resumed["by_step"] == summary["by_step"]
@@ -84,7 +84,7 @@ def test_stopped_in_the_middle_it_goes_on(finished, tmp_path, capsys):
 
 def test_other_settings_do_not_mix(finished):
     out, _ = finished
-    with pytest.raises(InputError, match="another 'seed'"):
+    with pytest.raises(InputError, match="different 'seed'"):
         other = small_config()
         run_demo(out, dataclasses.replace(other, train=dataclasses.replace(other.train, seed=9)), progress=False)
 

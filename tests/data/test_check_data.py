@@ -28,7 +28,7 @@ def test_check_data_accepts_sound_scenes(data, capsys):
     printed = capsys.readouterr().out
     assert "3 scenes read, no problem" in printed and "problem:" not in printed
     for layout in ("genesis", "kubric", "videos"):
-        assert f"data/{layout}: {layout}, 4 steps at 12 a second, 3 cameras, 48x32 pixels" in printed
+        assert f"data/{layout}: {layout}, 4 steps at 12 fps, 3 cameras, 48x32 pixels" in printed
     assert [path.name for path in data.parent.iterdir() if path != data] == ["sheet.png"]
 
 

@@ -75,7 +75,7 @@ def test_colmap_images_are_cameras_of_one_step(tmp_path, binary, model_folder):
     folder = write_colmap(tmp_path / "scene", made, binary=binary, model_folder=model_folder, points=seen_points())
     scene = Scene.open(folder)
     assert (scene.layout, scene.n_steps, scene.n_cams) == ("colmap", 1, 4) and find_scenes(tmp_path) == [folder]
-    assert scene.camera_names[0] == "images/view 10.png" and "a camera of one instant" in describe(scene)
+    assert scene.camera_names[0] == "images/view 10.png" and "its own camera at a single step" in describe(scene)
     cameras = scene.cameras_at(range(4), [0])
     np.testing.assert_allclose(cameras.viewmats, made.viewmats[0], atol=2e-6)
     np.testing.assert_allclose(cameras.Ks, made.Ks[0], rtol=1e-6)
@@ -144,7 +144,7 @@ def test_colmap_camera_models_are_read(tmp_path, model, binary):
 @pytest.mark.parametrize("binary", [True, False])
 def test_colmap_unread_camera_models_are_refused_by_name(tmp_path, model, binary):
     write_colmap(tmp_path, make_scene(n_steps=1), binary=binary, model=model, params=[50, 50, 24, 16, 0.9])
-    with pytest.raises(InputError, match=f"camera 10: the model {model} is not read"):
+    with pytest.raises(InputError, match=f"camera 10: camera model {model} is not supported"):
         Scene.open(tmp_path)
 
 
@@ -168,7 +168,7 @@ def test_colmap_alpha_is_the_mask(tmp_path):
 def test_colmap_notes_name_other_models(tmp_path):
     folder = write_colmap(tmp_path, make_scene(n_steps=1))
     shutil.copytree(folder / "sparse/0", folder / "sparse/1")
-    assert "1 other models beside it are not" in describe(Scene.open(folder))
+    assert "1 other models are ignored" in describe(Scene.open(folder))
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
@@ -189,11 +189,11 @@ def test_colmap_truncated_binary_files_are_refused(tmp_path, name):
 DAMAGE = {
     "a word": ("cameras.txt", " 48 32 ", " 48 wide ", "cameras.txt: line 2 cannot be read"),
     "too few": ("cameras.txt", "10 PINHOLE 48 32 ", "10 PINHOLE 48 32 1.0 ", "PINHOLE has 4 parameters; got 5"),
-    "no camera": ("images.txt", " 10 view", " 99 view", "is of camera 99, which is not in"),
+    "no camera": ("images.txt", " 10 view", " 99 view", "has camera 99, which is not in"),
     "no pose": ("images.txt", "view 10.png", "", "cannot be read"),
-    "outside": ("images.txt", "view 10.png", "../../x.png", "out of the scene"),
+    "outside": ("images.txt", "view 10.png", "../../x.png", "not a file inside the scene"),
     "twice": ("images.txt", "view 10.png", "view 11.png", "two images have the same name"),
-    "no points": ("images.txt", "\n\n", "\n", "must hold the points of the image before it, or be empty"),
+    "no points": ("images.txt", "\n\n", "\n", "must hold the previous image's 2D points, or be empty"),
     "not UTF-8": ("images.txt", "view 10.png", "vi\udcff.png", "not UTF-8"),
 }
 
@@ -233,7 +233,7 @@ def test_colmap_quaternions_must_be_unit(tmp_path):
 def test_colmap_names_without_number_are_refused_with_fps(tmp_path):
     folder = write_colmap(tmp_path, make_scene(n_steps=1), names=lambda step, cam: f"{'abc'[cam]}.png")
     (folder / "scene.json").write_text('{"fps": 30}')
-    with pytest.raises(InputError, match="has no number, which is its time"):
+    with pytest.raises(InputError, match="has no frame number, needed because"):
         Scene.open(folder)
 
 

@@ -57,7 +57,7 @@ def test_make_frames_without_labels(scenes, tmp_path):
     for masked in (False, None):
         frames = make_frames([scene], [[0]], [[0]], masked=masked)
         assert frames.masks is None and frames.dynamic is None
-    with pytest.raises(InputError, match="no labels"):
+    with pytest.raises(InputError, match="no segmentation labels"):
         make_frames([scene], [[0]], [[0]], masked=True)
 
 

@@ -87,7 +87,7 @@ def test_as_mask_refuses_photos(tmp_path):
     three_lossy = stored(tmp_path, "m.jpg", three)
     for image, name in ((ramp, "m.png"), (noise, "m.png"), (three_lossy, "m.jpg"), (three_lossy, "m.png"),
                         (discs(100), "m.jpg"), (discs(2), "m.jpg"), (np.full_like(ramp, 120), "m.png")):  # fmt: skip
-        with pytest.raises(InputError, match=rf"{name} \(camera a, frame 0\) is no mask"):
+        with pytest.raises(InputError, match=rf"{name} \(camera a, frame 0\) is not a mask"):
             moving(image, tmp_path / name)
     assert not moving(np.zeros_like(ramp), tmp_path / "m.jpg").any()
     assert moving(np.full_like(ramp, 255), tmp_path / "m.jpg").all()
@@ -104,7 +104,7 @@ def test_scene_with_jpeg_masks(tmp_path):
     np.testing.assert_array_equal(scene.segmentation(range(3), range(4)) == MOVING, made.labels == MOVING)
     file = folder / "masks" / "cam_1" / "004.jpg"
     cv2.imwrite(str(file), np.tile(np.linspace(0, 255, 64).astype(np.uint8), (48, 1)))
-    assert any("004.jpg (camera cam_1, frame 4) is no mask" in line for line in check_scene(folder).problems)
+    assert any("004.jpg (camera cam_1, frame 4) is not a mask" in line for line in check_scene(folder).problems)
 
 
 COLOUR = np.random.default_rng(1).integers(0, 256, (*SIZE[::-1], 3), dtype=np.uint8)
@@ -184,7 +184,7 @@ def test_read_header_refuses_png_chunks_beyond_the_file(chunk, tmp_path):
         data[chunk : chunk + 4] = struct.pack(">I", claimed)
         (tmp_path / "a.png").write_bytes(data)
         assert not read_header(bytes(data)).whole
-        with pytest.raises(InputError, match="its end is missing"):
+        with pytest.raises(InputError, match="it is truncated"):
             read_image(tmp_path / "a.png", SIZE, "camera a, frame 0", Problems())
 
 
@@ -208,7 +208,7 @@ def test_read_header_of_tiff_byte_orders_and_pages(tmp_path):
         read_image(file, SIZE, "", Problems())
     rows, orientation = struct.pack(">HHI", 278, 3, 1), struct.pack(">HHI", 274, 3, 1)  # optional here
     file.write_bytes(big_endian_tiff().replace(rows, orientation))
-    with pytest.raises(InputError, match="turned by its orientation tag"):
+    with pytest.raises(InputError, match="rotated by its orientation tag"):
         read_image(file, SIZE, "", Problems())
     white_is_zero = big_endian_tiff().replace(struct.pack(">HHIH", 262, 3, 1, 1), struct.pack(">HHIH", 262, 3, 1, 0))
     file.write_bytes(white_is_zero)
@@ -218,7 +218,7 @@ def test_read_header_of_tiff_byte_orders_and_pages(tmp_path):
     with pytest.raises(InputError, match="several pages"):
         read_image(file, SIZE, "", Problems())
     assert cv2.imwrite(str(file), COLOUR.astype(np.float32))
-    with pytest.raises(InputError, match="8 or 16 bits a channel; got float32"):
+    with pytest.raises(InputError, match="8 or 16 bits per channel; got float32"):
         read_image(file, SIZE, "", Problems())
 
 

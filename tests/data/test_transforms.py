@@ -46,7 +46,7 @@ def test_nerf_synthetic_views_are_cameras_of_one_step(tmp_path):
     np.testing.assert_allclose(cameras.Ks, [[[focal, 0, 24], [0, focal, 16], [0, 0, 1]]] * 3, rtol=1e-6)
     labels = scene.segmentation(order, [0])[0].numpy()
     np.testing.assert_array_equal(labels == MOVING, made.labels[0, :3] > 0)
-    assert "transforms_val.json are cameras" in describe(scene) and find_scenes(tmp_path) == [tmp_path]
+    assert "transforms_val.json are added as cameras" in describe(scene) and find_scenes(tmp_path) == [tmp_path]
 
 
 @pytest.mark.parametrize("count", [1, 4])
@@ -58,7 +58,7 @@ def test_d_nerf_is_one_moving_camera(tmp_path, count):
     assert (scene.n_steps, scene.n_cams, scene.cameras_move) == (6, 1, True) and scene.fps == pytest.approx(5)
     wanted = np.stack([made.viewmats[row] for row in rows])
     np.testing.assert_allclose(scene.cameras_at([0], range(6)).viewmats, wanted, atol=1e-6)
-    assert "transforms_test.json has other times" in describe(scene)
+    assert "transforms_test.json is ignored: its times differ" in describe(scene)
     assert check_scene(tmp_path).problems == ()
 
 
@@ -110,8 +110,8 @@ MISSING = {
     "cx": r"intrinsics of camera .*frame 1: cx is missing",
     "cy": r"intrinsics of camera .*frame 1: cy is missing",
     "transform_matrix": r"transform_matrix of camera .*frame 1 is missing",
-    "time": r"has no time, others have",
-    "file_path": r"file_path must be text; got 'None'",
+    "time": r"has no time, but other frames have",
+    "file_path": r"file_path must be a string; got 'None'",
 }
 
 
@@ -127,7 +127,7 @@ def test_transforms_missing_keys_are_named(tmp_path, key, how):
                 key == "fl_x" and frame.pop("fl_y")
 
     edit_json(tmp_path / "transforms.json", edit)
-    message = "time of frames holds null" if (key, how) == ("time", "null") else MISSING[key]
+    message = "time of frames contains null" if (key, how) == ("time", "null") else MISSING[key]
     with pytest.raises(InputError, match="transforms.json: .*" + message) as error:
         Scene.open(tmp_path)
     assert "not finite" not in str(error.value)
@@ -137,7 +137,7 @@ def test_transforms_missing_keys_are_named(tmp_path, key, how):
 def test_transforms_wrong_types_are_named(tmp_path, value):
     write_transforms(tmp_path, make_scene())
     edit_json(tmp_path / "transforms.json", lambda content: content["frames"][0].update(transform_matrix=value))
-    with pytest.raises(InputError, match="transform_matrix of camera .* (must be numbers|holds null)"):
+    with pytest.raises(InputError, match="transform_matrix of camera .* (must be numbers|contains null)"):
         Scene.open(tmp_path)
 
 
@@ -150,7 +150,7 @@ def test_transforms_frames_of_one_camera_need_times(tmp_path):
             frame["camera"] = frame["file_path"].split("/")[1]
 
     edit_json(tmp_path / "transforms.json", edit)
-    with pytest.raises(InputError, match="12 frames without time .* 3 cameras"):
+    with pytest.raises(InputError, match="12 frames of 3 cameras have no time"):
         Scene.open(tmp_path)
 
 

@@ -263,9 +263,7 @@ def test_truncated_images_are_named(tmp_path):
     assert Scene.open(folder).recorded_images([1], [2]).float().mean() > 5
     for cut in (whole[: len(whole) * 3 // 4], whole[:-2]):
         file.write_bytes(cut)
-        with pytest.raises(
-            InputError, match=r"004.jpg \(camera cam_1, frame 4\) cannot be decoded: its end is missing"
-        ):
+        with pytest.raises(InputError, match=r"004.jpg \(camera cam_1, frame 4\) cannot be decoded: it is truncated"):
             Scene.open(folder).recorded_images([1], [2])
 
 

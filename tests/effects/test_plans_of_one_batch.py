@@ -54,5 +54,5 @@ def test_plans_of_one_batch_refuse_mismatches():
     plans = [simulator.plan(EffectsSpec(outputs=OutputEffects(depth=on))) for on in (True, False)]
     with pytest.raises(InputError, match="plans: there must be one for each of 2 scenes; got 1"):
         simulator.rollout(state, 1, plans=plans[:1])
-    with pytest.raises(InputError, match="plans: those of one batch must ask for the same images"):
+    with pytest.raises(InputError, match="plans: must have equal outputs"):
         simulator.render(state, target_cameras(frames, 2), plans=plans)

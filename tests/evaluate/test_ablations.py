@@ -111,7 +111,7 @@ def test_steps_are_shared_by_the_phases():
 
 def test_base_run_takes_a_preset_or_a_configuration(tmp_path):
     (tmp_path / "train.yaml").write_text("preset: tiny")
-    with pytest.raises(InputError, match="--preset: --config describes the base run"):
+    with pytest.raises(InputError, match="--preset: cannot be combined with --config"):
         base_run(BASES, "tiny", tmp_path / "train.yaml")
     assert base_run(BASES, None, tmp_path / "train.yaml").preset == "tiny"
     assert base_run(BASES) == BASES["tiny"]
@@ -146,7 +146,7 @@ def test_runs_in_processes_score_as_one_after_another(folders, tmp_path):
     expected = run(asked, tmp_path / "one")
     late = run(asked, out, minutes=1e-9)
     assert late["rows"][0]["runs"] == [{"seed": seed, "trained": 0, "of": 2} for seed in (0, 1)]
-    assert "latent, seed 1: 0 of 2 optimizer steps; call again to go on" in (out / "ablation.md").read_text()
+    assert "latent, seed 1: 0 of 2 optimizer steps; run again to resume" in (out / "ablation.md").read_text()
     said = []
     content = run(asked, out, together=2, say=said.append)
     assert scores(content) == scores(expected)
@@ -160,7 +160,7 @@ def test_rows_of_other_histories_are_scored_over_the_same_steps(folders, tmp_pat
     rows = {row["row"]: row for row in content["rows"]}
     assert rows["history-1"]["copy.psnr"] == pytest.approx(rows["latent"]["copy.psnr"], abs=1e-9)
     assert rows["history-2"]["same_as"] == "latent" and rows["history-2"]["runs"] == rows["latent"]["runs"]
-    assert "is latent" in markdown(content) and not (tmp_path / "history-2").exists()
+    assert "same as latent" in markdown(content) and not (tmp_path / "history-2").exists()
 
 
 def test_targets_are_cameras_that_no_row_has_as_input(folders):
@@ -228,15 +228,15 @@ def test_command_lists_rows_and_refuses_wrong_input(folders, tmp_path, capsys):
     (tmp_path / "none.yaml").write_text("rows: 3\n")
     for arguments, message in (
         ([data, "--rows", "latent,none", "--out", out], "--rows: 'none' does not exist; rows: latent, explicit"),
-        ([data, "--rows", "latent,latent", "--out", out], "named twice"),
+        ([data, "--rows", "latent,latent", "--out", out], "repeats a row"),
         ([data, "--preset", "tinny", "--out", out], "must be one of tiny, small, paper_latent; got 'tinny'"),
-        ([data, "--table", str(tmp_path / "none.yaml"), "--out", out], "none.yaml: must hold bases and rows"),
+        ([data, "--table", str(tmp_path / "none.yaml"), "--out", out], "none.yaml: must contain bases and rows"),
         ([data, "--table", str(tmp_path / "absent.yaml"), "--out", out], "absent.yaml: does not exist"),
         ([data, "--seeds", "0", "--out", out], "--seeds: must be at least 1"),
         ([data, "--together", "0", "--out", out], "--together: must be at least 1"),
         ([data, "--minutes", "0", "--out", out], "--minutes: must be a finite number above 0; got 0"),
         ([data], "--out is needed"),
-        ([str(folders[0]), "--out", out], "two are needed"),
+        ([str(folders[0]), "--out", out], "at least two are needed"),
         ([data, "--config", str(tmp_path / "long.yaml"), "--out", out], "row latent: "),
     ):
         assert main(["ablate", *arguments]) == 2
@@ -246,8 +246,8 @@ def test_command_lists_rows_and_refuses_wrong_input(folders, tmp_path, capsys):
 
 def test_folder_of_another_run_is_refused(folders, tmp_path):
     run(study(folders, "latent"), tmp_path)
-    with pytest.raises(InputError, match="was started with another 'phases'"):
+    with pytest.raises(InputError, match="was started with a different 'phases'"):
         run(study(folders, "latent", with_steps(BASE, 3)), tmp_path)
     run(study(folders[:2], "latent"), tmp_path / "fewer")
-    with pytest.raises(InputError, match="was trained on fewer scenes than are given now"):
+    with pytest.raises(InputError, match="was trained on fewer scenes than given now"):
         run(study(folders, "latent"), tmp_path / "fewer")

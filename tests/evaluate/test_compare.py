@@ -35,10 +35,10 @@ def test_differences_and_errors_by_hand():
     [
         ([21.0, 21.0, 21.1], "better"),
         ([19.0, 19.0, 19.1], "worse"),
-        ([21.0, 19.0, 20.9], "the same within two standard errors"),
-        ([20.0, 20.0, 20.0], "the same within two standard errors"),
-        ([21.9, 20.1, 21.0], "the same within two standard errors"),  # 1.9 standard errors
-        ([21.0], "of one scene: no standard error"),
+        ([21.0, 19.0, 20.9], "equal within two standard errors"),
+        ([20.0, 20.0, 20.0], "equal within two standard errors"),
+        ([21.9, 20.1, 21.0], "equal within two standard errors"),  # 1.9 standard errors
+        ([21.0], "single scene: no standard error"),
     ],
 )
 def test_verdict_needs_two_standard_errors(ours, verdict):
@@ -95,10 +95,10 @@ def other_history(other):
 @pytest.mark.parametrize(
     "damage, message",
     [
-        (without_digest, "b.json: nothing says which images of a were scored"),
-        (other_film, "b.json: b has other images, labels or target cameras"),
-        (fewer_scenes, r"b.json: other scenes: b is not scored there \(1 scenes differ\)"),
-        (more_scenes, "b.json: other scenes: z is scored there alone"),
+        (without_digest, "b.json: has no digest of the scored images of a"),
+        (other_film, "b.json: images, labels or target cameras of b differ"),
+        (fewer_scenes, r"b.json: different scenes: b is not scored there \(1 scenes differ\)"),
+        (more_scenes, "b.json: different scenes: z is scored only there"),
         (other_steps, "b.json: 28 predicted steps, here 80"),
         (other_history, "b.json: 2 given steps, here 4"),
     ],

@@ -83,9 +83,9 @@ def test_another_rate_is_refused_with_both_numbers(restored, tmp_path):
     with pytest.raises(InputError, match="24 frames per second"):
         restored.check_scene(Scene.open(folder))
     for fps in (30, 6):
-        with pytest.raises(InputError, match=f"{fps} frames per second; .* trained at 12 .no whole multiple"):
+        with pytest.raises(InputError, match=f"{fps} frames per second; .* trained at 12 .not an integer multiple"):
             restored.open_scene(at_rate(folder, fps))
-        with pytest.raises(InputError, match=f"{fps} frames per second are no whole multiple of the 12"):
+        with pytest.raises(InputError, match=f"its {fps} fps are not an integer multiple of the requested 12"):
             restored.open_scene(folder, resample=True)
     assert restored.open_scene(at_rate(folder, 12.01)).n_steps == 6
 
@@ -120,7 +120,7 @@ def test_a_checkpoint_without_a_rate_is_not_checked_and_says_so(folder, tmp_path
     assert old.fps is None
     with pytest.warns(FitWarning, match="frame rate not checked"):
         old.open_scene(folder)
-    with pytest.raises(InputError, match="--resample: the checkpoint does not say"):
+    with pytest.raises(InputError, match="--resample: the checkpoint does not contain"):
         old.open_scene(folder, resample=True)
 
 
@@ -135,7 +135,7 @@ def test_a_rate_that_is_none_is_refused(folder, tmp_path, fps):
 
 def test_training_scenes_have_one_rate(folder, tmp_path):
     scenes = [Scene.open(folder), Scene.open(at_rate(write_scene(tmp_path / "c"), 24))]
-    with pytest.raises(InputError, match="c: 24 frames per second, .* has 12; a model has one rate"):
+    with pytest.raises(InputError, match="c: 24 frames per second, .* has 12; rates must be equal"):
         check_scenes(scenes, CONFIG.data, [PhaseConfig(steps=1, target_views=2)])
     check_scenes(scenes[:1] * 2, CONFIG.data, [PhaseConfig(steps=1, target_views=2)])
 

@@ -84,7 +84,7 @@ def test_any_rig_of_two_cameras_or_more_is_predicted(restored, tmp_path, n_cams)
         warnings.simplefilter("always")
         views = default_views(restored, scene)
     assert views == VIEWS[n_cams]
-    few = f"fitted to the model: {n_cams} input views, cameras {' '.join(map(str, range(n_cams)))}; training had 4"
+    few = f"fitted to the model: {n_cams} input views, cameras {' '.join(map(str, range(n_cams)))}; training used 4"
     assert [few in str(warning.message) for warning in said] == [True] * (n_cams < 4)
     assert predict(restored, scene, views[0], 1).particles.means.isfinite().all()
 
@@ -122,7 +122,7 @@ def test_cropping_is_reported_and_can_be_avoided(restored, tmp_path):
     folder = portrait(tmp_path / "scene")
     cut, said = opened(restored, folder)
     assert said == (
-        "fitted to the model: images of 24x48 pixels scaled to 32x32, of which 50% is cut off (--keep image keeps it)"
+        "fitted to the model: images of 24x48 pixels scaled to 32x32, 50% cropped (--keep image preserves it)"
     )
     whole, said = opened(restored, folder, "image")
     assert said == "fitted to the model: images of 24x48 pixels scaled to 32x32"
@@ -174,11 +174,14 @@ def test_published_models_keep_their_depths(restored, tmp_path):
     released = SimpleNamespace(config=ReleasedModelConfig(), inputs=restored.simulator.inputs)
     published = dataclasses.replace(restored, simulator=released)
     scene, said = opened(published, rig(tmp_path / "scene", 5, near=0.5, far=9.0))
-    assert (scene.near, scene.far) == (1.2, 4.0) and "depths 0.5 to 9 replaced by 1.2 to 4" in said
+    assert (scene.near, scene.far) == (
+        1.2,
+        4.0,
+    ) and "depth range 0.5 to 9 replaced by that of the training, 1.2 to 4" in said
 
 
 def test_an_unknown_part_is_named(restored, tmp_path):
-    with pytest.raises(InputError, match="keep must name parts of image, depth; got 'masks'"):
+    with pytest.raises(InputError, match="keep must contain only image, depth; got 'masks'"):
         restored.open_scene(rig(tmp_path / "scene", 2), ("masks",))
 
 

@@ -103,7 +103,7 @@ def test_length_of_a_video_gives_its_start(data, folder, n_future, n_frames, fir
 def test_video_of_ambiguous_length_is_refused(data, folder):
     shutil.rmtree(folder / "ball" / "0000" / "cam_1")
     flat_video(folder / "ball" / "0000" / "cam_1.mp4", [9] * 4)  # steps 0 to 3, or 2 to 5?
-    with pytest.raises(InputError, match="is the first one step 0 or 2"):
+    with pytest.raises(InputError, match="its first frame may be step 0 or 2"):
         Predictions.open(str(folder), data).images(scene_of(data), [1], GIVEN, 2)
 
 
@@ -216,18 +216,18 @@ def test_sixteen_bits_and_alpha_are_read_like_recordings(data, folder):
         (repeat_step, r"again_0003.png and frame3.png are both step 3"),
         (resize_step, r"frame4.png .*has 31x33 pixels, its camera 32x32"),
         (break_step, r"frame4.png .*cannot be decoded"),
-        (short_video, r"cam_1.mp4 has 3 frames; .* must have 6 .* or without the given ones 4"),
+        (short_video, r"cam_1.mp4 has 3 frames; .* must have 6 .* or without the input steps 4"),
         (long_video, r"cam_1.mp4 has more than 6 frames"),
         (large_video, r"cam_1.mp4 .*has 34x32 pixels, its camera 32x32"),
         (uneven_video, r"cam_1.mp4: its 4 frames are 40 to 400 ms apart"),
         (cut_video, r"cam_1.mp4 .*cannot be (opened|decoded)"),
-        (float_tiff, r"frame4.tif .*must have 8 or 16 bits a channel; got float32"),
+        (float_tiff, r"frame4.tif .*must have 8 or 16 bits per channel; got float32"),
         (unscaled_steps, r"cam_1: colours are 0 and 1 of 255"),
         (endless_png, r"frame4.png .*has 2147483647x32 pixels, its camera 32x32"),
         (cut_png, r"frame4.png .*cannot be decoded"),
         (folder_as_step, r"frame4.png .*is missing"),
         (two_dozen_digits, r"cam_1: step 4 is missing"),
-        (broken_video, r"cam_1.mp4 .*cannot be opened: broken, cut off or no video"),
+        (broken_video, r"cam_1.mp4 .*cannot be opened: it is damaged, truncated or not a video"),
     ],
 )
 def test_what_does_not_fit_is_named(data, folder, damage, message, capfd):
@@ -239,7 +239,7 @@ def test_what_does_not_fit_is_named(data, folder, damage, message, capfd):
 def test_folders_and_names_are_checked(data, folder, tmp_path):
     with pytest.raises(InputError, match="nowhere is not a folder"):
         Predictions.open("x=nowhere", data)
-    with pytest.raises(InputError, match="'copy' is taken"):
+    with pytest.raises(InputError, match="'copy' is reserved"):
         Predictions.open(f"copy={folder}", data)
     (tmp_path / "other" / "ball" / "0000" / "cam_9").mkdir()
     with pytest.raises(InputError, match="predictions of camera 9, but .* has 5 cameras"):
@@ -304,10 +304,10 @@ def test_a_report_is_not_written_where_predictions_do_not_fit(data, folder, caps
     "arguments, message",
     [
         (["{data}"], "nothing to evaluate"),
-        (["{data}", "--predictions", "{other}"], "--given: without a CHECKPOINT"),
+        (["{data}", "--predictions", "{other}"], "--given: the number of input steps"),
         (["{data}", "--predictions", "{other}", "--given", "0"], "at least 1"),
         (["{data}", "--predictions", "{other}", "--given", "6"], "only 0 after the input"),
-        (["{data}", "--predictions", "{other}", "--predictions", "{other}", "--given", "2"], "two have the same name"),
+        (["{data}", "--predictions", "{other}", "--predictions", "{other}", "--given", "2"], "names must be unique"),
         (["{data}", "--predictions", "{other}", "--given", "2", "--cameras", "7"], "camera 7 does not exist"),
         (["{data}", "--predictions", "{other}", "--given", "2", "--metrics", "speed"], "'speed' does not exist"),
         (["{data}", "--predictions", "{other}", "--given", "2", "--metrics", "fvd"], "run gsim3d weights fvd"),

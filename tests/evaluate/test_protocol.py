@@ -83,7 +83,7 @@ def test_views_that_are_named(restored, scene):
     assert default_views(restored, scene, (1, 0), (4, 1)) == ((1, 0), (4, 1))
     context, target = default_views(restored, scene, None, (0, 3))
     assert target == (0, 3) and len(context) == 2 and not {0, 3} & set(context)
-    with pytest.raises(InputError, match="1 cameras left as inputs; training had 2 views"):
+    with pytest.raises(InputError, match="1 cameras left as inputs; training used 2 views"):
         default_views(restored, scene, None, (0, 1, 2))
     elsewhere = dataclasses.replace(restored, data=DataConfig(context_views=2, target_only_cameras=(7,)))
     assert default_views(elsewhere, scene, (0, 1), (2,)) == ((0, 1), (2,))

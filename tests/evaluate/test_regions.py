@@ -87,7 +87,11 @@ def test_the_report_says_how_much_the_future_adds():
     assert one["by_step"]["body_share"] == pytest.approx([1 / 3] * S)
     assert one["perfect_ground.future.psnr_masked"] == db(0.2**2 / 3) and "perfect_ground.future.psnr" not in one
     for text in (table(one), markdown(one, "data")):
-        assert "Bodies: 33.3% of the mask." in text and "that the future adds" in text and "perfect_body" in text
+        assert (
+            "Bodies: 33.3% of the foreground." in text
+            and "predicted minus given steps" in text
+            and "perfect_body" in text
+        )
 
 
 def test_unknown_parts_are_not_reported():
@@ -95,7 +99,7 @@ def test_unknown_parts_are_not_reported():
     bare = SceneTruth("b", truth, None, None, GIVEN, METRICS).score([("constant", truth[GIVEN:])])
     summary = summarize([bare])
     assert bare.body_share is None and list(bare.values) == ["constant"]
-    assert "body_share" not in summary and "the future adds" not in table(summary)
+    assert "body_share" not in summary and "minus given steps" not in table(summary)
     mixed = summarize([scored(), bare])  # the second scene has no labels
     assert mixed["methods"] == ["constant"] and "psnr_masked" in mixed["not_measured"] and "body_share" in mixed
 

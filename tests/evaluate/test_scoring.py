@@ -69,15 +69,15 @@ def test_metrics_that_do_not_apply_are_reported(monkeypatch):
         "psnr_body": "ball/3 has no segmentation",
         "psnr_ground": "ball/3 has no segmentation",
         "psnr_ring": "ball/3 has no segmentation",
-        "ssim": "ball/3 has images of 14x10 pixels; it needs 11",
-        "lpips_alex": "ball/3 has images of 14x10 pixels; it needs 31",
-        "lpips_vgg": "ball/3 has images of 14x10 pixels; it needs 16",
-        "fvd": "it needs 10 predicted steps; ball/3 has 3",
+        "ssim": "ball/3 has images of 14x10 pixels; at least 11 are required",
+        "lpips_alex": "ball/3 has images of 14x10 pixels; at least 31 are required",
+        "lpips_vgg": "ball/3 has images of 14x10 pixels; at least 16 are required",
+        "fvd": "10 predicted steps are required; ball/3 has 3",
     }
     summary = summarize([judge.score([("model", video(height=10))])], {"psnr": "not wanted"})
     assert "future.psnr" not in summary and len(notes(summary)) == len(METRICS)
     assert "PSNR masked: not measured: ball/3 has no segmentation" in table(summary)
-    assert "FVD: not measured: it needs 10 predicted steps" in markdown(summary, "data")
+    assert "FVD: not measured: 10 predicted steps are required" in markdown(summary, "data")
 
 
 @pytest.fixture
@@ -110,9 +110,9 @@ def test_fvd_compares_the_predicted_steps_of_all_scenes_and_views(cheap_features
     # A shift of 0.1 in each of 6 features and no other difference.
     assert summary["future.fvd"] == pytest.approx(6 * 0.1**2, rel=1e-4) and summary["n_clips"] == 6
     assert summary["copy.future.fvd"] == pytest.approx(0, abs=1e-12)
-    assert notes(summary) == ["FVD: of 6 clips; below 256 it shows a trend, not a measurement"]
+    assert notes(summary) == ["FVD: 6 clips; with fewer than 256 it is biased and noisy"]
     one = SceneTruth("a", videos[0][:, :1], None, None, GIVEN, ("fvd",)).score([("model", videos[0][:, :1])])
-    assert "needs 2 clips" in summarize([one])["not_measured"]["fvd"]
+    assert "at least 2 clips" in summarize([one])["not_measured"]["fvd"]
 
 
 def test_lpips_is_measured_with_both_networks(monkeypatch):

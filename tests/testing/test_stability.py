@@ -206,7 +206,7 @@ def test_sample_round_trip(tmp_path):
     ("arguments", "message"),
     [
         (["--stability", "{tmp}/nowhere"], "no such file or folder"),
-        (["--stability", "{tmp}"], "holds no scene"),
+        (["--stability", "{tmp}"], "contains no scene"),
         (["--stability", "--only", "gravity"], "unknown check 'gravity'"),
         (["--stability", "--steps", "0"], "--steps: must be at least 1"),
         (["--replay", "{tmp}/note.txt"], "not a file that gsim3d doctor --stability wrote"),

@@ -64,7 +64,7 @@ def run_together(rank: int, out: str) -> None:
         assert trainer.train_step()["skipped"] == "process 1: broken" and trainer.n_skipped == 1
         if rank == 1:
             next(trainer.simulator.parameters()).data.mul_(1 + 1e-6)
-        with pytest.raises(InputError, match="weights: not the same in all processes"):
+        with pytest.raises(InputError, match="weights: differs between the processes"):
             trainer.begin_run(math.inf)
 
 

@@ -388,5 +388,5 @@ def test_capture_refuses_models_that_draw(scenes, trainer):
 
 
 def test_settings_that_do_not_fit_are_refused(scenes, tmp_path):
-    with pytest.raises(InputError, match="captured: needs workers 0"):
+    with pytest.raises(InputError, match="captured: requires workers: 0"):
         Trainer(dataclasses.replace(CONFIG, captured=True, workers=2), scenes, tmp_path)

@@ -51,13 +51,16 @@ def test_missing_settings_come_from_the_base():
             r"data\.resize: must be \[width, height\], multiples of 16 up to 32768; got \[100, 128\]",
         ),
         ({"data": {"resize": [128]}}, r"data\.resize: must be \[width, height\]"),
-        ({"data": {"near_far": [2, 1]}}, r"data\.near_far: must be two rising distances above 0; got \[2.0, 1.0\]"),
+        (
+            {"data": {"near_far": [2, 1]}},
+            r"data\.near_far: must be \[near, far\] with 0 < near < far",
+        ),
         ({"loss": {"perceptual": -1}}, r"perceptual must be at least 0"),
         ({"optimizer": {"beta1": "x"}}, r"^optimizer\.beta1: must be a number"),
         ({"optimizer": {"beta1": 1.0}}, r"beta1 must be below 1"),
         ({"optimizer": 3}, r"^optimizer: must be a mapping"),
         ({"phases": 3}, r"^phases: must be a list"),
-        ({"phases": []}, r"phases: at least one"),
+        ({"phases": []}, r"phases: must contain at least one"),
         ({"stages": [{"steps": 1}]}, r"^stages: unknown setting; .*; it is now called 'phases'$"),
         ({"data": {"thawed": 0.5}}, r"^data\.thawed: .*; it is now called 'unfrozen_background'$"),
         ({"phases": [{"steps": 1, "lead": 2}]}, r"^phases\[0\]\.lead: .*; this version no longer has it$"),
@@ -125,7 +128,7 @@ def test_impossible_model_is_refused(content, message):
 
 def test_impossible_layer_sizes_are_named(monkeypatch):
     monkeypatch.setattr(restore, "simulator_class", lambda config: lambda config: torch.zeros(3) @ torch.zeros(2))
-    with pytest.raises(InputError, match="model: no model has these sizes: RuntimeError: inconsistent tensor size"):
+    with pytest.raises(InputError, match="model: sizes are not valid: RuntimeError: inconsistent tensor size"):
         build_simulator(presets.tiny(), 0)
 
 

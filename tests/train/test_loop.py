@@ -223,7 +223,7 @@ def test_perceptual_loss_is_added(folder, tmp_path, monkeypatch):
 
 
 def test_another_configuration_does_not_resume(folder, finished):
-    with pytest.raises(InputError, match="another 'seed'"):
+    with pytest.raises(InputError, match="different 'seed'"):
         Trainer(TrainConfig(**{**vars(CONFIG), "seed": 1}), scenes(folder), finished)
     assert Trainer(TrainConfig(**{**vars(CONFIG), "log_every": 5}), scenes(folder), finished).step == 6
 
@@ -232,7 +232,7 @@ def test_resumed_run_accepts_more_scenes_only(folder, tmp_path):
     known = scenes(folder)
     Trainer(CONFIG, known[:1], tmp_path).run(until=1, progress=False)
     assert Trainer(CONFIG, known[:1], tmp_path).same_scenes and not Trainer(CONFIG, known, tmp_path).same_scenes
-    with pytest.raises(InputError, match="trained on 1 scenes that are not given now, such as ball/0000"):
+    with pytest.raises(InputError, match="trained on 1 scenes that are missing now, such as ball/0000"):
         Trainer(CONFIG, known[1:], tmp_path)
 
 
@@ -270,7 +270,7 @@ def test_what_does_not_fit_is_named(folder, tmp_path):
     with pytest.raises(InputError, match="camera 77 of data.target_only_cameras does not exist"):
         data = DataConfig(context_views=1, target_only_cameras=(77,))
         Trainer(TrainConfig(phases=CONFIG.phases, data=data), scenes(folder), tmp_path)
-    with pytest.raises(InputError, match="5 steps, but this model sees up to 2"):
+    with pytest.raises(InputError, match="5 steps, but this model takes at most 2"):
         phases = (PhaseConfig(steps=1, horizon=1, target_views=2),)
         Trainer(TrainConfig(phases=phases, data=DataConfig(history=5, context_views=2)), scenes(folder), tmp_path)
     with pytest.raises(InputError, match="preset: must be one of"):

@@ -77,7 +77,7 @@ def train_together(rank: int, folder: str, out: str) -> None:
         torch.save(normalised(slice(rank, None, 2)), out / f"rows_{rank}.pt")
         state = {name: value.double().sum().item() for name, value in trainer.simulator.state_dict().items()}
         assert processes.gather(state)[0] == state
-        with pytest.raises(InputError, match="CONFIG: not the same in all processes"):
+        with pytest.raises(InputError, match="CONFIG: differs between the processes"):
             Trainer(dataclasses.replace(LAYER, seed=rank), scenes(folder), out / "other", processes=processes)
 
 
@@ -167,7 +167,7 @@ def test_shares_cover_the_batch():
 
 
 def test_batches_that_cannot_be_shared_are_refused(folder, tmp_path):
-    with pytest.raises(InputError, match=r"phases\[0\].batch: 2 samples are too few for 3 processes"):
+    with pytest.raises(InputError, match=r"phases\[0\].batch: must be at least the 3 processes; got 2"):
         Trainer(LAYER, scenes(folder), tmp_path, processes=Processes(0, 3))
     with pytest.raises(InputError, match="workers: must be 0 in 2 processes"):
         Trainer(dataclasses.replace(LAYER, workers=2), scenes(folder), tmp_path, processes=Processes(0, 2))

@@ -99,7 +99,7 @@ def test_a_run_that_only_skips_stops_and_can_go_on_with_another_rate(folder, tmp
         trainer.run(progress=False)
     message = str(caught.value)
     assert message.startswith(
-        "training: 3 steps in a row were skipped up to step 5, the last because the loss is not finite"
+        "training: 3 consecutive steps were skipped up to step 5, the last because the loss is not finite"
     )
     assert "optimizer.clip_norm" in message and str(tmp_path) in message and caught.value.step == 5
     assert [line["step"] for line in curve(tmp_path) if "skipped" in line] == [3, 4, 5]
@@ -114,7 +114,7 @@ def test_a_run_that_only_skips_stops_and_can_go_on_with_another_rate(folder, tmp
     assert trainer.step == saved.state["step"] == 4
     trainer.run(progress=False)
     assert trainer.step == 8 and trainer.n_skipped_in_a_row == 0
-    with pytest.raises(InputError, match="another 'phases'"):
+    with pytest.raises(InputError, match="different 'phases'"):
         Trainer(dataclasses.replace(calmer, phases=(dataclasses.replace(PHASE, horizon=1),)), scenes(folder), tmp_path)
 
 

@@ -1,1 +1,1 @@
-"""Perceptual distances of images (LPIPS) and of sets of clips (FVD), and the weights they need."""
+"""Perceptual metrics LPIPS and FVD, and their weights."""

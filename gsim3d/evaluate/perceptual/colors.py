@@ -1,4 +1,4 @@
-"""Images as metrics want them: colours in [0, 1]."""
+"""Validation of images and conversion to colours in [0, 1]."""
 
 from __future__ import annotations
 
@@ -7,17 +7,18 @@ from torch import Tensor
 
 from gsim3d.errors import InputError
 
-ROUNDING = 1e-6  # what colours may be outside of [0, 1]
+ROUNDING = 1e-6  # tolerance for colours outside of [0, 1]
 
 
 def as_colors(images: Tensor, name: str) -> Tensor:
-    """``images`` as float32 or float64 in [0, 1].
+    """Converts ``images`` to float32 or float64 in [0, 1].
 
     Args:
-        images: floating, or uint8, which is divided by 255.
-        name: of the argument, for messages.
+        images: floating point, or uint8, which is divided by 255.
+        name: name of the argument, for messages.
+
     Raises:
-        InputError: another dtype, or numbers that are not finite or outside of [0, 1].
+        InputError: another dtype, or values that are not finite or outside of [0, 1].
     """
     check_colors(images, name)
     if images.dtype == torch.uint8:
@@ -26,15 +27,13 @@ def as_colors(images: Tensor, name: str) -> Tensor:
 
 
 def check_colors(images: Tensor, name: str) -> None:
-    """Raises InputError where :func:`as_colors` does."""
+    """Raises InputError as :func:`as_colors` does."""
     if not isinstance(images, Tensor):
         raise InputError(f"{name}: must be a tensor; got {type(images).__name__}")
     if images.dtype == torch.uint8 or not images.numel():
         return
     if not images.is_floating_point():
-        raise InputError(f"{name}: must be uint8, or floating with colours in [0, 1]; got {images.dtype}")
+        raise InputError(f"{name}: must be uint8, or floating point in [0, 1]; got {images.dtype}")
     least, most = (bound.item() for bound in images.detach().aminmax())
-    if not (-ROUNDING <= least and most <= 1 + ROUNDING):  # NaN is not, either
-        raise InputError(
-            f"{name}: colours must be in [0, 1]; got {least:g} to {most:g} (divide what goes to 255, or clamp)"
-        )
+    if not (-ROUNDING <= least and most <= 1 + ROUNDING):  # also rejects NaN
+        raise InputError(f"{name}: colours must be in [0, 1]; got {least:g} to {most:g} (divide by 255, or clamp)")

@@ -1,4 +1,4 @@
-"""Published weight files -> tensors under the names of our networks, read without running anything of theirs."""
+"""Conversion of published weight files to state dicts of LPIPS and I3D, without executing their code."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from torch import Tensor
 from gsim3d.errors import InputError
 from gsim3d.io.pickles import check_pickle
 
-BATCH_NORM_EPSILON = 1e-3  # of the network that the I3D weights come from
+BATCH_NORM_EPSILON = 1e-3  # of the original I3D
 
-# The names that a pickle of dicts of numpy arrays needs; nothing else can be called.
+# The only names that a weights pickle may load: those of numpy arrays.
 ALLOWED = {
     ("numpy", "ndarray"): np.ndarray,
     ("numpy", "dtype"): np.dtype,
@@ -36,18 +36,18 @@ _LOGITS = "Logits/Conv3d_0c_1x1"
 class _ArrayUnpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str):
         if (module, name) not in ALLOWED:
-            raise InputError(f"the file asks for {module}.{name}; weights need numpy arrays only")
+            raise InputError(f"the pickle references {module}.{name}; only numpy arrays are allowed in weights")
         return ALLOWED[module, name]
 
 
 def read_arrays(content: bytes) -> dict:
-    """Nested dicts of numpy arrays from a pickle. Raises InputError where it holds anything else."""
+    """Reads nested dicts of numpy arrays from a pickle. Raises InputError if it contains anything else."""
     try:
         check_pickle(content)
         tree = _ArrayUnpickler(io.BytesIO(content)).load()
     except InputError:
         raise
-    except Exception as error:  # a broken pickle raises whatever its bytes happen to mean
+    except Exception as error:  # a damaged pickle can raise any exception
         raise InputError(f"not a readable pickle: {str(error)[:200]}") from None
     _check_tree(tree)
     return tree
@@ -62,7 +62,7 @@ def _check_tree(tree) -> None:
 
 
 def lpips_tensors(tree: dict) -> dict[str, Tensor]:
-    """State of :class:`gsim3d.evaluate.perceptual.lpips.LPIPS`."""
+    """Returns the state dict of :class:`gsim3d.evaluate.perceptual.lpips.LPIPS`."""
     (network,) = (name for name in tree if not name.startswith("NetLinLayer"))
     state = {}
     for i in range(len(tree[network])):
@@ -75,7 +75,7 @@ def lpips_tensors(tree: dict) -> dict[str, Tensor]:
 
 
 def i3d_tensors(tree: dict) -> dict[str, Tensor]:
-    """State of :class:`gsim3d.evaluate.perceptual.i3d.I3D`: batch norms are folded in float64."""
+    """Returns the state dict of :class:`gsim3d.evaluate.perceptual.i3d.I3D`; batch norms are folded in float64."""
     params, statistics = tree["params"], tree["batch_stats"]
     logits = params[_LOGITS]["Conv_0"]
     state = {

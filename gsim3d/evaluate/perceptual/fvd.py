@@ -1,7 +1,7 @@
-"""FVD: how different two sets of clips look and move, from the features of a video classifier.
+"""FVD (Frechet Video Distance) between two sets of clips.
 
-``|mean_a - mean_b|^2 + tr(C_a + C_b - 2 (C_a C_b)^(1/2))`` over the 400 logits of I3D (Kinetics-400), the Frechet
-distance between two Gaussians fitted to them.
+``|mean_a - mean_b|^2 + tr(C_a + C_b - 2 (C_a C_b)^(1/2))``, the Frechet distance between Gaussians fitted to the 400
+logits of I3D (Kinetics-400).
 
 Source:
     Unterthiner et al. 2018, "Towards accurate generative models of video: a new metric and challenges".
@@ -19,29 +19,30 @@ from gsim3d.evaluate.perceptual.i3d import I3D, INPUT_SIZE
 from gsim3d.evaluate.perceptual.weights import load
 from gsim3d.nn.layers import exact_convolutions
 
-MIN_FRAMES = 10  # I3D halves time three times and then averages pairs
-MIN_CLIPS = 2  # a covariance needs two
-TREND_CLIPS = 256  # with fewer clips the fitted Gaussians are crude: a trend, not a measurement
+MIN_FRAMES = 10  # I3D halves time three times, then averages pairs
+MIN_CLIPS = 2  # for a covariance
+TREND_CLIPS = 256  # with fewer clips the fitted covariances are inaccurate
 
 
 @torch.no_grad()
 def clip_features(clips: Tensor) -> Tensor:
-    """I3D's logits of each clip, resized to 224 x 224 (bilinear, the whole image, aspect not kept).
+    """Computes I3D's logits of each clip, resized to 224 x 224 (bilinear, without keeping the aspect ratio).
 
     Args:
-        clips: [K, T, H, W, 3], T at least 10, floating with colours in [0, 1], or uint8, which is divided by 255.
+        clips: [K, T, H, W, 3], T at least 10, floating point in [0, 1], or uint8, which is divided by 255.
+
     Returns:
         float64 [K, 400].
+
     Raises:
-        InputError: shapes that do not fit, clips that are not in [0, 1], or the weights are not installed
-            (`gsim3d weights fvd`).
+        InputError: shapes are wrong, clips are not in [0, 1], or the weights are not installed (`gsim3d weights fvd`).
     """
     check_colors(clips, "fvd: clips")
     if clips.ndim != 5 or clips.shape[-1] != 3 or clips.shape[1] < MIN_FRAMES or 0 in clips.shape[2:]:
         raise InputError(f"fvd: clips must be [K, T, H, W, 3] with T >= {MIN_FRAMES}; got {tuple(clips.shape)}")
     module = load("fvd_i3d", I3D).to(clips.device)
     features = []
-    for clip in clips:  # one at a time: a clip alone takes some hundred megabytes
+    for clip in clips:  # one at a time: a clip takes several hundred megabytes
         frames = as_colors(clip, "fvd: clips").permute(0, 3, 1, 2).float()
         frames = F.interpolate(frames, (INPUT_SIZE, INPUT_SIZE), mode="bilinear")
         with exact_convolutions():
@@ -50,27 +51,29 @@ def clip_features(clips: Tensor) -> Tensor:
 
 
 def fvd(a: Tensor, b: Tensor) -> float:
-    """FVD between two sets of clips, [K, T, H, W, 3] each (K at least 2, T at least 10), colours in [0, 1].
+    """Computes the FVD between two sets of clips, [K, T, H, W, 3] each (K at least 2, T at least 10), in [0, 1].
 
-    Symmetric; 0 for equal sets. Below 256 clips it is biased upwards and noisy: compare only equal numbers of clips.
+    Symmetric; 0 for equal sets. With fewer than 256 clips it is biased upwards and noisy: compare only equal numbers of
+    clips.
     """
     return frechet_distance(clip_features(a), clip_features(b))
 
 
 def frechet_distance(a: Tensor, b: Tensor) -> float:
-    """Squared Frechet (2-Wasserstein) distance of the Gaussians fitted to two sets of vectors.
+    """Computes the squared Frechet (2-Wasserstein) distance between Gaussians fitted to two sets of vectors.
 
     Mean and sample covariance (n - 1), in float64. With centred rows X scaled so that C = X^T X, the trace of
-    (C_a C_b)^(1/2) is the sum of singular values of X_a X_b^T: no matrix square root, exact for singular covariances.
+    (C_a C_b)^(1/2) is the sum of singular values of X_a X_b^T, which is exact for singular covariances.
 
     Args:
         a, b: [N, D] and [M, D], N and M at least 2.
+
     Raises:
-        InputError: shapes that do not fit, or vectors that are not finite.
+        InputError: shapes are wrong, or vectors are not finite.
     """
     if a.ndim != 2 or b.ndim != 2 or a.shape[1] != b.shape[1] or min(len(a), len(b)) < MIN_CLIPS:
         got = f"{tuple(a.shape)} and {tuple(b.shape)}"
-        raise InputError(f"frechet_distance: [N, D] and [M, D], N, M >= 2, are needed; got {got}")
+        raise InputError(f"frechet_distance: must be [N, D] and [M, D] with N, M >= 2; got {got}")
     if not (a.isfinite().all() and b.isfinite().all()):
         raise InputError("frechet_distance: vectors must be finite")
     means, roots = [], []

@@ -1,7 +1,7 @@
-"""I3D, the video classifier of FVD: Inception-v1 with its kernels inflated in time, and 400 classes.
+"""I3D, the video classifier of FVD: Inception-v1 with kernels inflated in time, and 400 classes.
 
-Batch norms are folded into the convolutions before them when the weights are converted (weights.py), so every unit is
-a convolution, a bias and a ReLU.
+Batch norms are folded into convolutions when weights are converted (convert.py), so every unit is a convolution with
+bias and a ReLU.
 
 Source:
     Carreira and Zisserman 2017, "Quo vadis, action recognition? A new model and the Kinetics dataset".
@@ -32,7 +32,7 @@ POOLS = {"mixed_4b": ((3, 3, 3), (2, 2, 2)), "mixed_5b": ((2, 2, 2), (2, 2, 2))}
 
 
 class I3D(nn.Module):
-    """[K, 3, T, 224, 224] in [-1, 1], T at least 9 -> logits [K, 400], averaged over time."""
+    """I3D network: clips [K, 3, T, 224, 224] in [-1, 1] with T >= 9 to logits [K, 400], averaged over time."""
 
     def __init__(self):
         super().__init__()
@@ -57,7 +57,7 @@ class I3D(nn.Module):
 
 
 class Inception(nn.Module):
-    """Four branches side by side, their channels joined."""
+    """Inception block: four parallel branches, concatenated along channels."""
 
     def __init__(self, width: int, channels: tuple[int, ...]):
         super().__init__()
@@ -73,7 +73,7 @@ class Inception(nn.Module):
 
 
 class Unit(nn.Module):
-    """A cubic convolution with a bias, and a ReLU."""
+    """3D convolution with a cubic kernel and bias, and a ReLU."""
 
     def __init__(self, width: int, channels: int, kernel: int, stride: int = 1):
         super().__init__()
@@ -84,12 +84,12 @@ class Unit(nn.Module):
 
 
 def _max_pool(x: Tensor, kernel: tuple[int, ...], stride: tuple[int, ...]) -> Tensor:
-    # Padding with zeros changes no maximum: what is pooled comes out of a ReLU.
+    # Zero padding does not change maxima, because inputs are outputs of a ReLU.
     return F.max_pool3d(_pad_same(x, kernel, stride), kernel, stride)
 
 
 def _pad_same(x: Tensor, kernel: tuple[int, ...], stride: tuple[int, ...]) -> Tensor:
-    """Zeros around the last three axes so that ceil(size / stride) outputs fit; the odd one comes last."""
+    """Zero-pads the last three axes as TensorFlow's SAME: ceil(size / stride) outputs, odd padding at the end."""
     pads: list[int] = []
     for size, k, s in zip(reversed(x.shape[2:]), reversed(kernel), reversed(stride), strict=True):
         total = max((-(-size // s) - 1) * s + k - size, 0)

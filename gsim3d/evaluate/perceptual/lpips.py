@@ -1,8 +1,7 @@
-"""LPIPS: how different two images look, from the features of an image classifier.
+"""LPIPS (Learned Perceptual Image Patch Similarity), version 0.1.
 
-Images go through a classifier's convolutions; at five layers the features of each pixel are scaled to length 1, the
-squared difference of the two images' features is weighted by channel (the learned 1x1 head), averaged over pixels,
-and summed over layers. Version 0.1 of the weights.
+At five layers of an image classifier, the features of each pixel are normalised to length 1; their squared differences
+between two images are weighted by channel (a learned 1x1 head), averaged over pixels, and summed over layers.
 
 Source:
     Zhang et al. 2018, "The unreasonable effectiveness of deep features as a perceptual metric".
@@ -24,17 +23,22 @@ from gsim3d.nn.layers import exact_convolutions
 # Mean and deviation of the classifier's training images, for inputs in [-1, 1].
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
-MIN_SQUARE = (
-    1e-10  # added to the squared length of a feature vector: where all features are zero, gradients stay finite
-)
+MIN_SQUARE = 1e-10  # added to the squared length of feature vectors, which keeps gradients of zero vectors finite
 
-_CHUNK = 8  # images compared at once: bounds the memory of the features
+_CHUNK = 8  # images per batch, which bounds memory
 
 
 @dataclass(frozen=True)
 class _Conv:
-    """A convolution and the ReLU after it.  tap: whether LPIPS compares its output.  pool: kernel of a max pooling
-    (stride 2) before it, 0 for none."""
+    """Configuration of a convolution with ReLU.
+
+    Attributes:
+        channels: output channels.
+        kernel: kernel size.
+        stride: stride.
+        pool: kernel size of a max pooling with stride 2 before it; 0 for none.
+        tap: whether LPIPS compares its output.
+    """
 
     channels: int
     kernel: int
@@ -85,7 +89,7 @@ class LPIPS(nn.Module):
         return sum(layer.mean((1, 2)) for layer in self.maps(pred, target))
 
     def maps(self, pred: Tensor, target: Tensor) -> list[Tensor]:
-        """The weighted differences [I, h, w] of the five layers, each at its own resolution."""
+        """Returns the weighted differences [I, h, w] of the five layers, each at its own resolution."""
         pairs = zip(self.heads, self._features(pred), self._features(target), strict=True)
         return [((_unit(a) - _unit(b)).square() * head[:, None, None]).sum(1) for head, a, b in pairs]
 
@@ -111,15 +115,17 @@ def _unit(features: Tensor) -> Tensor:
 
 @torch.no_grad()
 def lpips(pred: Tensor, target: Tensor, network: str = "vgg") -> Tensor:
-    """LPIPS of each pair of images; 0 for equal ones.
+    """Computes the LPIPS of each pair of images; 0 for equal ones.
 
     Args:
-        pred, target: [I, H, W, 3], floating with colours in [0, 1], or uint8, which is divided by 255.
+        pred, target: [I, H, W, 3], floating point in [0, 1], or uint8, which is divided by 255.
         network: ``"alex"`` (sides of at least 31 pixels) or ``"vgg"`` (16).
+
     Returns:
         float64 [I].
+
     Raises:
-        InputError: shapes that do not fit, images that are not in [0, 1], or the weights are not installed
+        InputError: shapes are wrong, images are not in [0, 1], or the weights are not installed
             (`gsim3d weights lpips`).
     """
     pred, target = as_colors(pred, "lpips: pred"), as_colors(target, "lpips: target")

