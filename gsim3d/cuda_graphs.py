@@ -17,7 +17,7 @@ import dataclasses
 import functools
 import gc
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from gsim3d.cameras import Cameras
-from gsim3d.dynamics import FrozenContext, Partition, rollout
+from gsim3d.dynamics import Dynamics, FrozenContext, Partition, rollout
 from gsim3d.effects.plan import Plan
 from gsim3d.errors import CaptureError, InputError
 from gsim3d.nn.point_transformer import SparseConv
@@ -247,7 +247,7 @@ class CapturedRollout:
             raise InputError("CapturedRollout: finish() must follow launch()")
         self._launched = False
         found, moving, counted = self._arrive()
-        while moving > self._moving or not self._fits(found):
+        while moving > self._moving or not fit(self._capacities, found):
             self._moving = max(self._moving, self._capacity_for(moving))
             calls = zip(self._capacities, found, strict=True)
             grown = [capacity.grown(numbers, self._factor) for capacity, numbers in calls]
@@ -303,13 +303,7 @@ class CapturedRollout:
 
     def _observed(self) -> list[PyramidCapacity]:
         """Observes the capacities that the calls of the dynamics need, in a synchronising rollout."""
-        needed = []
-
-        def geometry(history: Particles) -> Pyramid:
-            pyramid = self._model.dynamics.geometry(history)
-            needed.append(PyramidCapacity.of(pyramid, self._model.dynamics.capacity(history), self._factor))
-            return pyramid
-
+        geometry, needed = observing_geometry(self._model.dynamics, self._factor)
         self._rollout(geometry, StabilityReport())
         return needed
 
@@ -322,19 +316,11 @@ class CapturedRollout:
     def _capacity_for(self, moving: int) -> int:
         return min(self._state.n_rows, math.ceil(self._factor * moving))
 
-    def _fits(self, found: list[list[int]]) -> bool:
-        return all([capacity.fits(numbers) for capacity, numbers in zip(self._capacities, found, strict=True)])
-
     def _given(self, report: StabilityReport) -> tuple[Prediction, Tensor]:
         """Computes the rollout with the current capacities; also returns the sizes found by each geometry."""
-        sizes, found = iter(self._capacities), []
-
-        def geometry(history: Particles) -> Pyramid:
-            found.append(self._model.dynamics.geometry(history, capacity=next(sizes)))
-            return found[-1]
-
+        geometry, found = fixed_geometry(self._model.dynamics, self._capacities)
         predicted = self._rollout(geometry, report)
-        return predicted, torch.stack([pyramid.found for pyramid in found])
+        return predicted, torch.stack(found)
 
     def _resize(self, capacities: list[PyramidCapacity]) -> None:
         """Sets the capacities and, on a GPU, captures the graph."""
@@ -436,6 +422,39 @@ class CapturedRollout:
         if self._copies:
             renderings = [Rendering(*(x if x is None else x.clone() for x in image)) for image in renderings]
         return Prediction(steps, list(renderings))
+
+
+def observing_geometry(
+    dynamics: Dynamics, factor: float
+) -> tuple[Callable[[Particles], Pyramid], list[PyramidCapacity]]:
+    """Returns a geometry function of exact sizes, and the list of capacities, with a margin, that its calls fill."""
+    needed: list[PyramidCapacity] = []
+
+    def geometry(history: Particles) -> Pyramid:
+        pyramid = dynamics.geometry(history)
+        needed.append(PyramidCapacity.of(pyramid, dynamics.capacity(history), factor))
+        return pyramid
+
+    return geometry, needed
+
+
+def fixed_geometry(
+    dynamics: Dynamics, capacities: Sequence[PyramidCapacity]
+) -> tuple[Callable[[Particles], Pyramid], list[Tensor]]:
+    """Returns a geometry function of fixed capacities, and the list of sizes found, which its calls fill."""
+    sizes, found = iter(capacities), []
+
+    def geometry(history: Particles) -> Pyramid:
+        pyramid = dynamics.geometry(history, capacity=next(sizes))
+        found.append(pyramid.found)
+        return pyramid
+
+    return geometry, found
+
+
+def fit(capacities: Sequence[PyramidCapacity], found: Sequence[Sequence[int]]) -> bool:
+    """Returns whether the sizes found by all geometries fit their capacities."""
+    return all([capacity.fits(sizes) for capacity, sizes in zip(capacities, found, strict=True)])
 
 
 class _Frozen(NamedTuple):

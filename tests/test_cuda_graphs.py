@@ -449,5 +449,5 @@ def test_cameras_that_do_not_fit_the_graph():
     captured = CapturedRollout(make_simulator(), make_state(), 1, cameras=make_cameras())
     with pytest.raises(InputError, match="2 of 16 x 16 pixels; got 3 of 16 x 16"):
         captured(make_state(), make_cameras(n_scenes=3))
-    with pytest.raises(InputError, match="in number and size, none; got 2"):
+    with pytest.raises(InputError, match="of the first ones, none; got 2"):
         CapturedRollout(make_simulator(), make_state(), 1)(make_state(), make_cameras())

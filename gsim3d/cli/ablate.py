@@ -1,4 +1,4 @@
-"""``gsim3d ablate``: the paper's ablations."""
+"""``gsim3d ablate``: trains and scores ablations."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import math
 from gsim3d.cli.arguments import number, whole
 
 EPILOG = """\
-Every row is the base run with one thing changed, trained on the same scenes for as many steps and scored on the scenes
-that `gsim3d train` holds out, all rows over the same steps. Rows and base runs are declared in
-configs/ablations/paper.yaml, or in the file --table; --list names the rows.
+Every row is the base run with one change, trained on the same scenes for the same number of steps, and scored on the
+scenes that `gsim3d train` holds out over the same steps. Rows and base runs are declared in
+configs/ablations/paper.yaml, or in the file of --table; --list prints the rows.
 
-Written to DIR: ablation.md and ablation.json (one table: PSNR beside baselines, paired differences, seconds a step, the
-paper's number) and a run folder ROW/seed_N for each training. Stopped and started again, it goes on where it was. More
-rows or seeds may be asked for later; the table has those of the last call, compared with the first of them.
+Output in DIR: ablation.md and ablation.json (a table of PSNR with baselines, paired differences, seconds per step, and
+the paper's numbers), and a run folder ROW/seed_N for each training. Run again, the command resumes. Rows and seeds can
+be added later; the table contains those of the last call, compared with the first row.
 
 examples:
   gsim3d ablate --list
@@ -25,21 +25,21 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Trains and scores the paper's ablations at a budget of your choice; one table out."
+    parser.description = "Trains and scores the paper's ablations at a given budget; writes a table."
     parser.epilog = EPILOG
     add = parser.add_argument
     add("data", metavar="DATA", nargs="?", help="folder with scenes of any layout (docs/reference/data.md)")
     add("--rows", default="latent,explicit,no-tem", metavar="ROW,...", help="rows to train (default: %(default)s)")
     add("--table", metavar="FILE", help="YAML file of rows and base runs (default: the paper's)")
-    add("--out", metavar="DIR", help="folder for the runs and the table; made if absent")
-    add("--config", metavar="CONFIG", help="YAML file of the base run, as of gsim3d train (default: one of --preset)")
+    add("--out", metavar="DIR", help="folder for the runs and the table, created if absent")
+    add("--config", metavar="CONFIG", help="YAML file of the base run, as for gsim3d train (default: see --preset)")
     add("--preset", metavar="PRESET", help="base run without --config (default: tiny)")
     add("--steps", type=whole(1), metavar="N", help="optimizer steps of each run (default: the base run's)")
-    add("--seeds", type=whole(1), default=1, metavar="N", help="runs of each row (default: 1)")
-    help = "runs at a time, a process each: a small model leaves most of a GPU idle (default: 1)"
+    add("--seeds", type=whole(1), default=1, metavar="N", help="runs per row (default: 1)")
+    help = "number of parallel runs, one process each; useful for small models on a GPU (default: 1)"
     add("--together", type=whole(1), default=1, metavar="N", help=help)
-    add("--minutes", type=number(0, above=True), metavar="M", help="train no longer; the next call goes on")
-    add("--device", choices=("cpu", "cuda"), default="cpu", help="where to train (default: cpu)")
+    add("--minutes", type=number(0, above=True), metavar="M", help="time limit; the next call resumes")
+    add("--device", choices=("cpu", "cuda"), default="cpu", help="device (default: cpu)")
     add("--list", action="store_true", help="print the rows and exit")
     add("--quiet", action="store_true", help="no progress bars")
 
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
         print(*(f"{row.name:{width}}{row.differs}" for row in rows.values()), sep="\n")
         return 0
     if args.data is None or args.out is None:
-        raise InputError(f"{'DATA' if args.data is None else '--out'} is needed (see gsim3d ablate --help)")
+        raise InputError(f"{'DATA' if args.data is None else '--out'} is required (see gsim3d ablate --help)")
     chosen = rows_named(args.rows, rows)
     base, out = base_run(bases, args.preset, args.config, args.steps), Path(args.out)
     if out.exists() and not out.is_dir():

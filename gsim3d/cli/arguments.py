@@ -1,4 +1,4 @@
-"""Argument parsing of all commands: no abbreviations, hints for unknown words, numbers with a range."""
+"""Argument parsing shared by all commands: no abbreviations, hints for unknown words, numbers with a range."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from gsim3d.pretrained import KEEP
 
 
 class Parser(argparse.ArgumentParser):
-    """Takes no abbreviations; its errors are InputErrors that suggest the nearest known word."""
+    """Argument parser without abbreviations, which raises InputError with suggestions."""
 
     def __init__(self, *args: Any, **options: Any):
         options = {"formatter_class": argparse.RawDescriptionHelpFormatter, **options, "allow_abbrev": False}
         super().__init__(*args, **options)
 
     def parsed(self, arguments: list[str]) -> argparse.Namespace:
-        """The arguments; options may stand between and behind the others."""
+        """Parses arguments; options and positional arguments may be mixed."""
         for word in arguments[: arguments.index("--")] if "--" in arguments else arguments:
             name = word.partition("=")[0]
             if word.startswith("--") and name not in self._option_string_actions:
@@ -43,17 +43,17 @@ def add_fitting(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         choices=KEEP,
         default=(),
-        help="what of the scene is not fitted to the model: image: scaled, not cropped; depth: near and far",
+        help="parts of the scene to preserve: image (scaled instead of cropped), depth (near and far)",
     )
     parser.add_argument(
         "--resample",
         action="store_true",
-        help="of a scene with k times the frame rate that the model was trained at, take every k-th frame",
+        help="subsample a scene with k times the model's frame rate to every k-th frame",
     )
 
 
 def whole(least: int, most: float = math.inf) -> Callable[[str], int]:
-    """The type of an option that takes a whole number from ``least`` to ``most``."""
+    """Returns the type of an option that takes an integer from ``least`` to ``most``."""
 
     def convert(text: str) -> int:
         return _within(int(text), least, most)
@@ -63,7 +63,7 @@ def whole(least: int, most: float = math.inf) -> Callable[[str], int]:
 
 
 def number(least: float, most: float = math.inf, *, above: bool = False) -> Callable[[str], float]:
-    """The type of an option that takes a finite number of at least ``least`` (or ``above`` it) and at most ``most``."""
+    """Returns the type of an option that takes a finite number from ``least`` (excluded if ``above``) to ``most``."""
 
     def convert(text: str) -> float:
         value = float(text)
@@ -76,7 +76,7 @@ def number(least: float, most: float = math.inf, *, above: bool = False) -> Call
 
 
 def decibels(text: str) -> float:
-    """The type of an option that takes a number of dB of at least 0, such as "0.1dB"."""
+    """Type of an option that takes a number of dB of at least 0, such as "0.1dB"."""
     try:
         value = float(text.removesuffix("dB"))
     except ValueError:

@@ -1,25 +1,25 @@
-"""``gsim3d check-data``: what is wrong with recorded scenes, and a picture that shows whether the cameras are right."""
+"""``gsim3d check-data``: validates recorded scenes, and draws a contact sheet of frames and cameras."""
 
 from __future__ import annotations
 
 import argparse
 
 EPILOG = """\
-Every file of every scene is read: descriptions, cameras, all images and masks. Each problem is one line that names
-file, camera and frame. Exit code: 0 nothing is wrong, 1 there are problems, 2 the check could not run.
+Reads every file of every scene: descriptions, cameras, all images and masks. Each problem is printed in one line with
+file, camera and frame. Exit code: 0 no problems, 1 problems found, 2 the check could not run.
 
-Layouts that load (docs/reference/data.md has every key):
+Supported layouts (all keys: docs/reference/data.md):
   genesis      metadata.json with n_steps, n_cams, file_path_template and cam_<j>: as `gsim3d generate` writes
   kubric       cam_<j>/metadata.json with rgba_<t>.png and segmentation_<t>.png: Kubric and MOVi
   transforms   transforms.json of nerfstudio, with a time for every frame
   videos       cameras.json, and for each camera one video <name>.mp4 or one folder <name>/<number>.png or .jpg
 
-Look at the picture: in every frame the orange box must stand around what moves, the world's axes (x red, y green,
-z blue) must point the same ways, and the other cameras (magenta) must be where you see them. The blue box is the
-bounds of the scene: given, or what most cameras see; the yellow line is the outline of the masks.
-  no axes and no orange box         y and z axes flipped (OpenGL for OpenCV), or camera-to-world for world-to-camera
-  the box is beside what moves      intrinsics of another image size, or a principal point that was not cropped along
-  it is so in one camera only       that camera's pose is wrong, or two cameras are exchanged
+Check the contact sheet: in every frame the orange box must enclose the moving bodies, the world axes (x red, y green, z
+blue) must point in consistent directions, and the other cameras (magenta) must be where they are seen. The blue box is
+the bounds of the scene, given or the region that most cameras see; the yellow line is the outline of the masks.
+  neither axes nor orange box       flipped y and z axes (OpenGL instead of OpenCV), or camera-to-world matrices
+  box next to the bodies            intrinsics of another image size, or a principal point not adjusted for cropping
+  wrong in one camera only          that camera's pose is wrong, or two cameras are swapped
 
 examples:
   gsim3d check-data runs/data --out check-data.png
@@ -29,12 +29,12 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = (
-        "Reads recorded scenes, lists every problem, and draws a picture of frames and cameras on request."
+        "Reads recorded scenes, lists all problems, and optionally draws a contact sheet of frames and cameras."
     )
     parser.epilog = EPILOG
     parser.add_argument("data", metavar="DIR", help="folder with scenes of any layout, or one scene folder")
-    parser.add_argument("--out", metavar="FILE.png", help="picture to draw (default: none)")
-    parser.add_argument("--quiet", action="store_true", help="no progress bar, only problems and the last line")
+    parser.add_argument("--out", metavar="FILE.png", help="contact sheet to write (default: none)")
+    parser.add_argument("--quiet", action="store_true", help="print only problems and the summary")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -64,6 +64,6 @@ def run(args: argparse.Namespace) -> int:
     n_bad = sum(bool(check.problems) for check in checks)
     read = f"{len(checks)} scene{'s' if len(checks) > 1 else ''} read"
     found = f"{n_problems} problem{'s' if n_problems > 1 else ''} in {n_bad}" if n_problems else "no problem"
-    drawn = "--out draws a picture of the cameras" if out is None else f"look at {out}"
-    print(f"{read}, {found}; {drawn if scenes else 'no scene could be drawn'}")
+    sheet = "use --out to draw a contact sheet" if out is None else f"contact sheet: {out}"
+    print(f"{read}, {found}; {sheet if scenes else 'no scene could be opened'}")
     return 1 if n_problems else 0

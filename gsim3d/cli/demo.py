@@ -1,23 +1,23 @@
-"""``gsim3d demo``: multi-view video is made and predicted, by a shipped simulator or one trained here."""
+"""``gsim3d demo``: generates multi-view video and predicts it with a shipped or a new simulator."""
 
 from __future__ import annotations
 
 import argparse
 
 EPILOG = """\
-Writes into DIR:
-  held_out/      multi-view video of soft bodies that fall on a round ground, made here; no training saw it
+Output in DIR:
+  held_out/      generated multi-view video of soft bodies falling on a round ground, not seen in training
   rollout.mp4    these scenes, truth above prediction
-  psnr.png       PSNR over time against the baselines
+  psnr.png       PSNR over time, with baselines
   metrics.json   all numbers; the most important ones are printed
-  gaussians/     the predicted 3D Gaussians of one scene, a .ply for each step
+  gaussians/     the predicted 3D Gaussians of one scene, one .ply per step
   overview.png   input views, Gaussians, predicted and true frames in one picture
 
-With --train, the main job at a small size, also
-  data/          instead of held_out/: smaller scenes, of which a few are held out
-  model/         checkpoints and log of the training; model.safetensors beside it is the result in one file
+With --train, which trains a small model, also
+  data/          instead of held_out/: smaller scenes, a few of them held out
+  model/         checkpoints and log of the training; the result is saved as model.safetensors
 
-One to three minutes on 2 cores; 7 to 10 minutes with --train. Stopped and started again, it goes on where it was.
+Takes one to three minutes on 2 cores; 7 to 10 minutes with --train. Run again, the command resumes.
 
 examples:
   gsim3d demo --out runs/demo
@@ -26,10 +26,10 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Makes multi-view video of falling bodies and predicts it with a simulator that never saw it."
+    parser.description = "Generates multi-view video of falling bodies and predicts it with a simulator."
     parser.epilog = EPILOG
-    parser.add_argument("--out", metavar="DIR", required=True, help="folder for everything; made if absent")
-    parser.add_argument("--train", action="store_true", help="learn the simulator here, from scratch")
+    parser.add_argument("--out", metavar="DIR", required=True, help="output folder, created if absent")
+    parser.add_argument("--train", action="store_true", help="train a new simulator from scratch")
 
 
 def run(args: argparse.Namespace) -> int:

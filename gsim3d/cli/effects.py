@@ -1,4 +1,4 @@
-"""``gsim3d effects infer``: the smallest spec under which a model predicts a scene as well as under its own."""
+"""``gsim3d effects infer``: finds the cheapest effects specification without loss of quality on a scene."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from gsim3d.io.terminal import progress
 from gsim3d.pretrained import CHECKPOINT_HELP
 
 EPILOG = """\
-Each effect that the checkpoint's spec has on is switched off alone, or lowered, and predictions of four steps at the
-video's begin, middle and end are compared with it: what it is worth is how many dB of PSNR that loses, what it costs
-is the time of a step and its images. The smallest settings within the tolerance are combined; while the combination
-loses more, the one that is worth most is put back. What is measured as slower is not proposed.
+Each effect of the checkpoint's specification is disabled or reduced on its own. Predictions of four steps at the start,
+middle and end of the video then give its worth, the loss of PSNR in dB, and its cost, the time of a step with images.
+The smallest settings within the tolerance are combined; while the combination loses more, the setting of the effect
+with the largest loss is restored. Settings that are slower are not proposed.
 
-It is the model that is measured: if its predictions are hardly better than particles held still (the first line shows
-both), it has not learned what the effects are for, and the proposal says little about the scene. Times of a few
-milliseconds waver; let nothing else run.
+The result depends on the model: if its predictions are hardly better than constant particles (the first line shows
+both), it has not learned to use the effects, and the proposal says little about the scene. Times of a few milliseconds
+are noisy; stop other programs.
 
 examples:
   gsim3d effects infer runs/data/ball/0000 runs/model --tolerance 0.1dB
@@ -26,18 +26,18 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Finds out which effects a scene needs, and writes them to effects.yaml."
+    parser.description = "Finds the effects that a scene requires, and writes them to effects.yaml."
     parser.epilog = EPILOG
-    parser.add_argument("action", choices=("infer",), help="infer: switch effects off one by one and compare")
+    parser.add_argument("action", choices=("infer",), help="infer: disable effects one by one and compare")
     parser.add_argument("scene", metavar="SCENE", help="scene folder of any layout (docs/reference/data.md)")
     parser.add_argument("checkpoint", metavar="CHECKPOINT", help=CHECKPOINT_HELP)
     parser.add_argument(
-        "--tolerance", type=decibels, default="0.1dB", metavar="X", help="PSNR that may be lost (default: 0.1dB)"
+        "--tolerance", type=decibels, default="0.1dB", metavar="X", help="largest loss of PSNR (default: 0.1dB)"
     )
-    parser.add_argument("--out", metavar="FILE", help="file to write; must not exist yet (default: SCENE/effects.yaml)")
+    parser.add_argument("--out", metavar="FILE", help="file to write; must not exist (default: SCENE/effects.yaml)")
     add_fitting(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
-    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to predict (default: cpu)")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="device (default: cpu)")
 
 
 def run(args: argparse.Namespace) -> int:

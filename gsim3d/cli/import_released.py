@@ -1,15 +1,15 @@
-"""``gsim3d import``: a checkpoint of the authors' release becomes one of this package."""
+"""``gsim3d import``: converts a checkpoint of the authors' release."""
 
 from __future__ import annotations
 
 import argparse
 
 EPILOG = """\
-CHECKPOINT is a .ckpt file of the release, CONFIG the resolved .yaml that lies beside it (configs/NAME.yaml for
-models/NAME.ckpt): sizes come from the weights, what no weight shows (cell size, strides, limits, history) from it.
-DIR becomes a checkpoint folder that simulate and evaluate take; its model reproduces the published one, oddities
-included (DIR/config.yaml has "release: true"). Tensors that are missing or of another shape are named, and nothing is
-written. The file is read without running anything in it: one that asks for other code is refused.
+CHECKPOINT is a .ckpt file of the release, CONFIG its resolved configuration (configs/NAME.yaml for models/NAME.ckpt).
+Sizes are taken from the weights; grid size, strides, limits and history from CONFIG. DIR becomes a checkpoint folder
+for simulate and evaluate, whose model reproduces the published one, including its bugs ("release: true" in
+DIR/config.yaml). Missing tensors and wrong shapes are an error, and nothing is written. The file is read without
+executing code in it; files that reference other code are rejected.
 
 examples:
   gsim3d import models/elastic.ckpt --config configs/elastic.yaml -o runs/elastic
@@ -19,11 +19,11 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Imports a checkpoint of the authors' release and tells what it found in it."
+    parser.description = "Imports a checkpoint of the authors' release and reports its content."
     parser.epilog = EPILOG
     parser.add_argument("checkpoint", metavar="CHECKPOINT", help="published checkpoint (.ckpt)")
     parser.add_argument("--config", metavar="CONFIG", required=True, help="its resolved configuration (.yaml)")
-    parser.add_argument("-o", "--out", metavar="DIR", required=True, help="folder to write; must not exist yet")
+    parser.add_argument("-o", "--out", metavar="DIR", required=True, help="folder to write; must not exist")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""``gsim3d plan``: what a scene calls for, and what a model therefore computes."""
+"""``gsim3d plan``: shows the computations that a model performs for a scene."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from gsim3d.cli.arguments import add_fitting
 from gsim3d.pretrained import CHECKPOINT_HELP, folder_of
 
 EPILOG = """\
-Without --effects the spec is effects.yaml of the scene or of the data set around it, else that of the checkpoint,
-which is what gsim3d simulate computes without --effects. Without a checkpoint the model is the preset tiny.
-Multiply-adds are predicted from the sizes of layers and the scene's masks, for matrix products, attention and splats:
-they compare two plans of one model (docs/reference/effects.md). If gsim3d profile has timed the checkpoint,
-milliseconds are predicted from its times.
+Without --effects, the specification is effects.yaml of the scene or its data set, or else that of the checkpoint, as
+for gsim3d simulate. Without a checkpoint, the model is the preset tiny. Multiply-adds of matrix products, attention and
+splats are predicted from layer sizes and the scene's masks; they compare two plans of one model
+(docs/reference/effects.md). If gsim3d profile has timed the checkpoint, milliseconds are predicted, too.
 
 examples:
   gsim3d plan runs/data/ball/0000
@@ -22,12 +21,12 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Shows which effects are computed and what that costs."
+    parser.description = "Shows which effects are computed, and their predicted costs."
     parser.epilog = EPILOG
     parser.add_argument("scene", metavar="SCENE", help="scene folder of any layout (docs/reference/data.md)")
     parser.add_argument("checkpoint", metavar="CHECKPOINT", nargs="?", help=CHECKPOINT_HELP)
     add_fitting(parser)
-    parser.add_argument("--effects", metavar="FILE", help="YAML file of what to compute (default: see below)")
+    parser.add_argument("--effects", metavar="FILE", help="YAML file of the effects (default: see below)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -55,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
         source = "the scene's own"
     plan, work = own if spec is None else simulator.plan(spec), workload(scene, data)
     size = f"1 image of {scene.width}x{scene.height}"
-    print(f"{scene.name}: {work.moving} moving and {work.frozen} frozen particles a step, {size}")
+    print(f"{scene.name}: {work.moving} moving and {work.frozen} frozen particles per step, {size}")
     print(f"model: {args.checkpoint or 'preset tiny, untrained'}; effects: {source}, {plan.spec.hash}")
     for paragraph in plan_report(simulator, plan, work, times, own):
         print(f"\n{paragraph}")

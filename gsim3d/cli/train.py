@@ -1,4 +1,4 @@
-"""gsim3d train: learn a simulator from a data set."""
+"""``gsim3d train``: trains a simulator on a data set."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import argparse
 from gsim3d.cli.arguments import whole
 
 EPILOG = """\
-CONFIG is a YAML file; what it leaves out has a default, what it does not know is an error. For example
+CONFIG is a YAML file. Missing keys have defaults; unknown keys are an error. For example:
 
   preset: tiny
   data: {history: 2, context_views: 4, target_only_cameras: [2, 7]}
@@ -15,9 +15,9 @@ CONFIG is a YAML file; what it leaves out has a default, what it does not know i
     - {steps: 400, history: 1, batch: 2, learning_rate: 2.0e-3}      # encoder and renderer
     - {steps: 800, horizon: 8, learning_rate: 1.0e-3}                # all parts, 8 simulated steps
 
-Scenes that `gsim3d evaluate` measures by default are left out (every 8th or so; see gsim3d.data.split_scenes).
-Called again, it goes on from the last checkpoint and repeats the same numbers as a run that was never stopped.
-Several processes, on one machine or many (tools/slurm/train.sbatch), share the samples of every step.
+The scenes that `gsim3d evaluate` scores by default are held out (about every 8th; see gsim3d.data.split_scenes). Run
+again, the command resumes from the last checkpoint, with the same numbers as an uninterrupted run. Several processes,
+on one or more machines (tools/slurm/train.sbatch), share the samples of every step.
 
 examples:
   gsim3d train --print-config > train.yaml
@@ -28,25 +28,25 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Learns a simulator from multi-view video; writes checkpoints and a log into a run folder."
+    parser.description = "Trains a simulator on multi-view video; writes checkpoints and a log into a run folder."
     parser.epilog = EPILOG
     parser.add_argument("config", metavar="CONFIG", nargs="?", help="YAML file with the run's settings")
     parser.add_argument("--data", metavar="DIR", help="folder with scenes of any layout (docs/reference/data.md)")
     parser.add_argument(
-        "--cache", metavar="DIR", help="keep decoded images in files here, for sets larger than the memory"
+        "--cache", metavar="DIR", help="cache decoded images in this folder, for data sets larger than memory"
     )
-    parser.add_argument("--out", metavar="DIR", help="run folder; made if absent")
-    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to train (default: cpu)")
+    parser.add_argument("--out", metavar="DIR", help="run folder, created if absent")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="device (default: cpu)")
     parser.add_argument(
         "--until", type=whole(1), metavar="STEP", help="stop after this optimizer step (default: the last)"
     )
     parser.add_argument("--export", metavar="FILE", help="also write the result as one .safetensors file")
     parser.add_argument("--tensorboard", action="store_true", help="also log to OUT/tensorboard, with sample videos")
-    parser.add_argument("--wandb", action="store_true", help="also log for Weights & Biases, as its own settings say")
+    parser.add_argument("--wandb", action="store_true", help="also log to Weights & Biases (see its own settings)")
     parser.add_argument(
-        "--viewer", action="store_true", help="show how a held-out scene is predicted, anew at each checkpoint"
+        "--viewer", action="store_true", help="show the prediction of a held-out scene, updated at each checkpoint"
     )
-    parser.add_argument("--profile", action="store_true", help="write a trace of two steps to OUT/profile, then go on")
+    parser.add_argument("--profile", action="store_true", help="write a trace of two steps to OUT/profile")
     parser.add_argument("--print-config", action="store_true", help="print all settings with their defaults and exit")
 
 
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
         return 0
     for name in ("config", "data", "out"):
         if getattr(args, name) is None:
-            raise InputError(f"{'CONFIG' if name == 'config' else f'--{name}'} is needed (see gsim3d train --help)")
+            raise InputError(f"{'CONFIG' if name == 'config' else f'--{name}'} is required (see gsim3d train --help)")
     if args.export:
         output_path(args.export, ".safetensors", "--export")
     folders, held_out = split_scenes(find_scenes(args.data))

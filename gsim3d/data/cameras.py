@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from gsim3d.data.recording import Problems, Recording
+from gsim3d.data.recording import Problems, Recording, evenly_spaced
 from gsim3d.math.rotations import rotation_matrices
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's camera axes (y up, z backwards) <-> OpenCV's
@@ -231,8 +231,7 @@ def _check_view_of_bounds(recording: Recording, viewmats: np.ndarray, problems: 
 
 def spread_steps(values: np.ndarray) -> np.ndarray:
     """Subsamples [S, ...] to at most MANY_STEPS evenly spaced steps."""
-    chosen = np.linspace(0, len(values) - 1, min(len(values), MANY_STEPS)).round().astype(int)
-    return values[chosen]
+    return values[evenly_spaced(len(values), MANY_STEPS)]
 
 
 def project(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from gsim3d.data import layouts
 from gsim3d.data.cameras import check_directions, positions_and_axes, project
-from gsim3d.data.recording import MOVING, Problems, Recording
+from gsim3d.data.recording import MOVING, Problems, Recording, evenly_spaced
 from gsim3d.data.scene import Scene
 from gsim3d.errors import InputError
 from gsim3d.io.terminal import plain
@@ -59,7 +59,8 @@ def check_scene(folder: str | Path) -> SceneCheck:
     if recording is not None:
         for cam, name in enumerate(recording.camera_names):
             try:
-                _check_images(recording, cam, problems)
+                for _ in recording.read_images(cam, range(recording.n_steps), problems):
+                    pass
             except InputError as error:
                 problems.add(f"camera {name}: {error}")
         if recording.read_labels is not None:
@@ -67,11 +68,6 @@ def check_scene(folder: str | Path) -> SceneCheck:
     if scene is not None and not problems.found:
         _check_agreement(Scene(path, recording), problems)  # a second Scene, so that its decoded images are freed
     return SceneCheck(path, scene, tuple(dict.fromkeys(problems.found)))
-
-
-def _check_images(recording: Recording, cam: int, problems: Problems) -> None:
-    for _ in recording.read_images(cam, range(recording.n_steps), problems):
-        pass
 
 
 def _check_labels(recording: Recording, problems: Problems) -> None:
@@ -93,7 +89,7 @@ def _check_agreement(scene: Scene, problems: Problems) -> None:
     """Reports an empty visual hull of the moving bodies, which indicates wrong poses."""
     if not scene.has_segmentation() or scene.n_cams < 2:
         return
-    hulls = [moving_box(scene, step) for step in _spread(scene.n_steps, HULL_STEPS)]
+    hulls = [moving_box(scene, step) for step in evenly_spaced(scene.n_steps, HULL_STEPS)]
     compared = [box for box, n_cams in hulls if n_cams > 1]
     if compared and all(box is None for box in compared):
         problems.add(
@@ -171,17 +167,19 @@ def contact_sheet(scenes: Sequence[Scene]) -> np.ndarray:
     Returns:
         uint8 [H, W, 3], BGR.
     """
-    shown = [scenes[i] for i in _spread(len(scenes), MAX_SCENES)]
+    shown = [scenes[i] for i in evenly_spaced(len(scenes), MAX_SCENES)]
     blocks = []
     for scene in shown:
-        steps = _spread(scene.n_steps, 3 if len(shown) == 1 else 1 if len(shown) > 3 else 2)
-        cams = _spread(scene.n_cams, MAX_CAMERAS)
+        steps = evenly_spaced(scene.n_steps, 3 if len(shown) == 1 else 1 if len(shown) > 3 else 2)
+        cams = evenly_spaced(scene.n_cams, MAX_CAMERAS)
         aspect = sum(width / height for width, height in (scene.recording.sizes[cam] for cam in cams))
         tile_height = int(np.clip((SHEET - GAP * len(cams)) / aspect, *TILE))
         blocks.append(_text(describe(scene)))
         for step in steps:
             body = _try(lambda: moving_box(scene, step)[0] if scene.has_segmentation() else None)
-            blocks.append(_side_by_side([_tile(scene, cam, step, tile_height, body) for cam in cams]))
+            tiles = [_tile(scene, cam, step, tile_height, body) for cam in cams]
+            padded = [np.pad(tile, ((0, GAP), (0, GAP), (0, 0)), constant_values=255) for tile in tiles]
+            blocks.append(np.concatenate(padded, 1)[:, :-GAP])
     legend = (
         "blue box: scene bounds; orange box: visual hull of moving bodies; red, green, blue: world x, y, z; "
         "magenta: other cameras; yellow: masks"
@@ -198,10 +196,6 @@ def _try(compute):
         return compute()
     except InputError:
         return None
-
-
-def _spread(n: int, most: int) -> list[int]:
-    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(int)).tolist()
 
 
 def _tile(scene: Scene, cam: int, step: int, tile_height: int, body: np.ndarray | None) -> np.ndarray:
@@ -268,11 +262,6 @@ def _write(image: np.ndarray, text: str, corner: Sequence[int], color: tuple) ->
     import cv2
 
     cv2.putText(image, plain(text), tuple(corner), cv2.FONT_HERSHEY_SIMPLEX, TEXT, color, 1, cv2.LINE_AA)
-
-
-def _side_by_side(tiles: list[np.ndarray]) -> np.ndarray:
-    padded = [np.pad(tile, ((0, GAP), (0, GAP), (0, 0)), constant_values=255) for tile in tiles]
-    return np.concatenate(padded, 1)[:, :-GAP]
 
 
 def _text(text: str) -> np.ndarray:

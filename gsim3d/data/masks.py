@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from gsim3d.data.recording import evenly_spaced
+
 MEDIAN_STEPS = 51  # evenly spaced steps from which the median is computed
 MIN_STEPS = 8  # fewest steps from which a background is estimated
 NOISE_FACTOR = 6.0  # foreground threshold, in multiples of the median difference ...
@@ -26,7 +28,7 @@ def median_image(read: Callable[[Sequence[int]], np.ndarray], n_steps: int) -> n
     Returns:
         uint8 [h, w, 3].
     """
-    steps = np.unique(np.linspace(0, n_steps - 1, min(n_steps, MEDIAN_STEPS)).round().astype(int)).tolist()
+    steps = evenly_spaced(n_steps, MEDIAN_STEPS)
     frames = read(steps)
     middle = len(steps) // 2
     return np.partition(frames, middle, axis=0)[middle]

@@ -271,6 +271,11 @@ def inside(folder: Path, relative: str, what: str) -> Path:
     raise InputError(f"{what} is not a file inside the scene folder: {str(relative)[:200]!r}")
 
 
+def evenly_spaced(n: int, most: int) -> list[int]:
+    """Returns at most ``most`` evenly spaced indices from 0 to n - 1, ascending."""
+    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(int)).tolist()
+
+
 def natural_order(text: str) -> list:
     """Returns a sort key that orders frame2 before frame10."""
     return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", text)]

@@ -1,7 +1,7 @@
-"""Videos: cameras.json, and for each camera one video file or one folder of numbered frames.
+"""Reader of videos: cameras.json, and for each camera a video file or a folder of numbered frames.
 
-Cameras are aligned by time: frame number n of a folder was taken at n / fps seconds, that of a video at its time stamp.
-Labels come from the folders labels or masks, else from alpha, else from subtraction of a still background. All keys:
+Cameras are synchronised by time: frame n of a folder is at n / fps seconds, frames of a video at their time stamps.
+Labels come from the folders labels or masks, or else from alpha, or else from background subtraction. All keys:
 docs/reference/data.md.
 """
 
@@ -38,11 +38,11 @@ FILE = "cameras.json"
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".webm", ".mov", ".avi")
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 DISTORTIONS = [(4,), (5,), (8,)]
-OWN_FOLDERS = ("masks", "labels")  # not names of cameras
+OWN_FOLDERS = ("masks", "labels")  # reserved, not camera names
 CONVERT = {"labels": as_labels, "masks": as_mask, "alpha": as_opaque}
-SAME_RATE = 5e-3  # 29.97 frames a second are called 30
-MOST_AGAIN = 100  # steps for each frame, of videos that are resampled
-MAX_DRIFT = 0.5  # frames by which videos of nearly one rate may run apart
+SAME_RATE = 5e-3  # relative; 29.97 and 30 fps count as equal
+MAX_RESAMPLING = 100  # steps per recorded frame of resampled videos
+MAX_DRIFT = 0.5  # frames; largest drift between videos of nearly equal rates
 
 
 def recognises(folder: Path) -> bool:
@@ -87,14 +87,12 @@ def read(folder: Path, problems: Problems) -> Recording:
     )
     subtract = masks == "subtract" and len(found.viewmats) == len(found.Ks) == 1 and found.n_steps >= MIN_STEPS
     if description.values.get("masks") == masks == "subtract" and not subtract:
-        problems.add(
-            f"{source}: masks: the background can be subtracted from {MIN_STEPS} frames or more of still cameras"
-        )
+        problems.add(f"{source}: masks: background subtraction requires static cameras and at least {MIN_STEPS} frames")
     return dataclasses.replace(found, subtract_background=subtract)
 
 
 def _entries(description: Description) -> dict[str, Description]:
-    """The cameras of a description by name."""
+    """Returns the camera descriptions by name."""
     values, found = description.values.get("cameras"), {}
     most = recording.MAX_CAMS
     if not isinstance(values, list) or not 1 <= len(values) <= most or not all(isinstance(e, dict) for e in values):
@@ -114,7 +112,7 @@ def _entries(description: Description) -> dict[str, Description]:
 
 
 def _unit(description: Description) -> float:
-    """Metres of the unit of T, near, far, origin and bounds."""
+    """Returns metres per unit of T, near, far, origin and bounds."""
     unit = description.values.get("units", "m")
     if not isinstance(unit, str) or unit not in UNITS:
         raise InputError(f"{description.where}units must be one of {', '.join(UNITS)}; got {unit!r}")
@@ -149,7 +147,7 @@ def _camera(entry: Description, name: str, size: tuple[int, int], n_steps: int, 
 
 
 def _lens(camera: Description) -> Lens | None:
-    """The lens of distortion, or of keys as in transforms.json."""
+    """Parses the lens from the key distortion, or from keys as in transforms.json."""
     values, what, problems = camera.values, camera.where.removesuffix(": "), camera.problems
     given = values.get("distortion", values.get("dist_k1k2p1p2k3"))
     values = {key: value for key, value in values.items() if key != "distortion"}
@@ -170,7 +168,7 @@ def _lens(camera: Description) -> Lens | None:
 
 
 def _masks(folder: Path, description: Description, sources: list[_Frames | Video]) -> str:
-    """Where labels come from: the folder labels or masks, "alpha", "subtract", or "none"."""
+    """Returns the source of labels: the folder "labels" or "masks", "alpha", "subtract" or "none"."""
     wanted = description.values.get("masks", "subtract")
     if wanted not in ("subtract", "none"):
         raise InputError(f'{description.where}masks must be "subtract" or "none"; got {wanted!r}')
@@ -182,13 +180,13 @@ def _masks(folder: Path, description: Description, sources: list[_Frames | Video
 
 
 def _frames_of(folder: Path, name: str, size: tuple[int, int], source: Path, problems: Problems) -> _Frames | Video:
-    """The frames of a camera; without any numbers where there is a problem."""
+    """Finds the frames of a camera; they have no numbers on error."""
     videos = [folder / f"{name}{suffix}" for suffix in VIDEO_SUFFIXES if (folder / f"{name}{suffix}").is_file()]
     frames = _Frames(folder, Path(name), name, size)
     if len(videos) == 1 and not (folder / name).is_dir():
         return Video(inside(folder, videos[0].name, f"camera {name}"), name, size, problems)
     if not frames.numbers:
-        found = f"found {', '.join(video.name for video in videos)}" if videos else "neither is there"
+        found = f"found {', '.join(video.name for video in videos)}" if videos else "found neither"
         problems.add(
             f"{source}: camera {name} needs a folder {name} with frames <number>.png or .jpg, or one video {name}.mp4 "
             f"({', '.join(VIDEO_SUFFIXES)}); {found}"
@@ -199,7 +197,7 @@ def _frames_of(folder: Path, name: str, size: tuple[int, int], source: Path, pro
 def _steps(
     sources: dict[str, _Frames | Video], fps: float | None, resample: float | None, source: Path, problems: Problems
 ) -> tuple[list[list[int]], float, list[str]]:
-    """Frames of all cameras that show one time: numbers of every camera step by step, steps a second, and notes."""
+    """Synchronises the cameras: returns frame numbers of each camera by step, steps per second, and notes."""
     videos = {name: frames for name, frames in sources.items() if isinstance(frames, Video) and frames.numbers}
     folders = {name: frames for name, frames in sources.items() if isinstance(frames, _Frames) and frames.numbers}
     if folders and fps is None:
@@ -209,7 +207,7 @@ def _steps(
     notes = [video.note for video in videos.values() if video.note]
     for video in videos.values():
         if video.rate is None and resample is None:
-            hint = f'give "resample", steps a second, in {source.name}'
+            hint = f'set "resample" (steps per second) in {source.name}'
             problems.add(f"{video.what} is uneven: {video.unevenness}; {hint}")
     rates = {name: video.rate for name, video in videos.items() if video.rate}
     slow, fast = min(rates, key=rates.get, default=None), max(rates, key=rates.get, default=None)
@@ -219,12 +217,12 @@ def _steps(
         if drift > MAX_DRIFT:
             problems.add(
                 f"{source}: the videos have {own_rate:.5g} (camera {slow}) and {rates[fast]:.5g} (camera {fast}) "
-                'frames a second; give "resample", steps a second'
+                'frames per second; set "resample" (steps per second)'
             )
     if rates and fps and abs(fps / own_rate - 1) > SAME_RATE:
         if folders:
-            problems.add(f"{source}: fps is {fps:g}, but the videos have {own_rate:g} frames a second")
-        notes.append(f"videos of {own_rate:g} frames a second are taken to have {fps:g}, as fps says")
+            problems.add(f"{source}: fps is {fps:g}, but the videos have {own_rate:g} frames per second")
+        notes.append(f"the frame rate of the videos, {own_rate:g} per second, is replaced by fps: {fps:g}")
     if resample is not None:
         numbers, more = _resampled({**folders, **videos}, fps, resample, source)
         n_steps = max(map(len, numbers.values()), default=1)
@@ -250,7 +248,7 @@ def _steps(
 def _resampled(
     sources: dict[str, _Frames | Video], fps: float | None, rate: float, source: Path
 ) -> tuple[dict[str, list[int]], list[str]]:
-    """For every camera the frames nearest to steps at ``rate`` a second, over the time that all cameras recorded."""
+    """Resamples to ``rate`` steps per second over the common time: the nearest frame of each camera at each step."""
     if not sources:
         raise InputError(f"{source}: the cameras have no frame in common")
     times = {}
@@ -262,11 +260,9 @@ def _resampled(
     if count < 1:
         raise InputError(f"{source}: the cameras have no time in common")
     n_frames = max(map(len, times.values()))
-    most = min(recording.MAX_STEPS, MOST_AGAIN * n_frames)
+    most = min(recording.MAX_STEPS, MAX_RESAMPLING * n_frames)
     if count > most:
-        raise InputError(
-            f"{source}: resample gives {count} steps of {n_frames} frames; more than {most} are taken to be a mistake"
-        )
+        raise InputError(f"{source}: resample gives {count} steps of {n_frames} frames; at most {most} are allowed")
     grid = low + np.arange(count) / rate
     numbers, off, again = {}, 0.0, 0
     for name, own in times.items():
@@ -274,13 +270,13 @@ def _resampled(
         numbers[name] = [sources[name].numbers[at] for at in nearest]
         off, again = max(off, np.abs(own[nearest] - grid).max()), max(again, int((np.diff(nearest) == 0).sum()))
     return numbers, [
-        f"resampled: frames lie up to {1000 * off:.3g} ms beside their steps, {again} of {count} steps show the frame "
-        "before again"
+        f"resampled: frames are up to {1000 * off:.3g} ms off their steps, {again} of {count} steps repeat the "
+        "previous frame"
     ]
 
 
 class _Frames:
-    """A folder of numbered images."""
+    """Folder of numbered images."""
 
     def __init__(self, scene: Path, folder: Path, name: str, size: tuple[int, int]):
         self._name, self._size, self._folder = name, size, scene / folder
@@ -295,7 +291,7 @@ class _Frames:
         self.numbers = sorted(self._files)
 
     def is_cut_out(self) -> bool:
-        """Whether some pixel of the first image is transparent."""
+        """Returns whether the first image has transparent pixels."""
         for number in self.numbers[:1]:
             header = header_of(self._files[number], self._name, Problems(collect=True))
             if header is not None and header.alpha and header.size == self._size:
@@ -304,8 +300,8 @@ class _Frames:
         return False
 
     def read(self, numbers: Sequence[int], problems: Problems, convert=as_color) -> Iterator[np.ndarray | None]:
-        """``convert`` of the images of these numbers; None where there is a problem."""
-        if not self._files:  # reported when the scene was opened
+        """Reads and converts the images with these numbers; yields None on error."""
+        if not self._files:  # already reported when the scene was opened
             yield from [None] * len(numbers)
             return
         for number in numbers:

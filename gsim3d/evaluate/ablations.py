@@ -24,6 +24,7 @@ import gsim3d
 from gsim3d.data import Scene, split_scenes
 from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import CaptureError, InputError, NumericalError, did_you_mean
+from gsim3d.evaluate.compare import paired
 from gsim3d.evaluate.protocol import horizon, score_scene
 from gsim3d.evaluate.report import summarize, write_json
 from gsim3d.io.files import MAX_TEXT, read_file, read_yaml, write_whole
@@ -390,7 +391,7 @@ def paired_difference(runs: Sequence[dict], first: Sequence[dict], metric: str) 
         return {}
     difference = statistics.fmean(itertools.chain(*pairs))
     means = [[statistics.fmean(part) for part in parts] for parts in (pairs, list(zip(*pairs)))]
-    error = max((statistics.stdev(part) / math.sqrt(len(part)) for part in means if len(part) > 1), default=None)
+    error = max((error for part in means if (error := paired(part)[1]) is not None), default=None)
     tie = None if error is None else abs(difference) <= TIE * error
     return {"difference": difference, "standard_error": error, "tie": tie}
 

@@ -8,9 +8,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from statistics import fmean
 
-import numpy as np
-
 from gsim3d.data import Scene
+from gsim3d.data.recording import evenly_spaced
 from gsim3d.dynamics import concatenate, last_steps
 from gsim3d.effects.plan import make_plan
 from gsim3d.effects.spec import EffectsSpec
@@ -79,23 +78,24 @@ def infer(restored: Restored, scene: Scene, tolerance: float, progress: Callable
 
 def smaller_settings(base: EffectsSpec, model: ModelConfig) -> Settings:
     """Returns every setting smaller than that of ``base``, per effect, in ascending order."""
-    plan, dynamics, appearance = make_plan(base, model), base.dynamics, base.appearance
+    plan = make_plan(base, model)
     history = [2**bits for bits in range(model.dynamics.history_bits + 1) if 2**bits < plan.history]
-    changing = {"all": ("none", "dynamic"), "none": ()}.get(appearance.changing, ("none",))
-    moves = {
+    changing = {"all": ("none", "dynamic"), "none": ()}.get(base.appearance.changing, ("none",))
+    dynamics_settings = {
         "history": [(f"{n} step{'s' * (n > 1)}", {"history": n}) for n in history],
         "background": [("masked out", {"background": "masked_out"})] if "background" in plan.on else [],
     }
-    looks = {
+    appearance_settings = {
         "view_dependent": [(f"degree {d}", {"view_dependent": d}) for d in range(plan.sh_degree)],
         "changing": [(which, {"changing": which}) for which in changing],
         "opacity_changes": [("off", {"opacity_changes": False})] if "opacity_changes" in plan.on else [],
     }
-    found = {k: [(name, replace(base, dynamics=replace(dynamics, **c))) for name, c in v] for k, v in moves.items()}
-    found |= {
-        k: [(name, replace(base, appearance=replace(appearance, **c))) for name, c in v] for k, v in looks.items()
+    return {
+        effect: [(name, replace(base, **{group: replace(getattr(base, group), **change)})) for name, change in settings]
+        for group, effects in (("dynamics", dynamics_settings), ("appearance", appearance_settings))
+        for effect, settings in effects.items()
+        if settings
     }
-    return {effect: settings for effect, settings in found.items() if settings}
 
 
 def propose(
@@ -168,8 +168,7 @@ class Trial:
         self.restored, self.scene, self.bar, n_encoded = restored, scene, bar, restored.data.history
         self.n_steps = min(STEPS, horizon(scene, n_encoded, None))
         context, self.cams = default_views(restored, scene)
-        last = scene.n_steps - n_encoded - self.n_steps
-        starts = np.unique(np.linspace(0, last, WINDOWS).round().astype(int)).tolist()
+        starts = evenly_spaced(scene.n_steps - n_encoded - self.n_steps + 1, WINDOWS)
         self.first = [start + n_encoded for start in starts]  # predicted steps of the video
         self.states = [encode_steps(restored, scene, context, start) for start in starts]
         videos = [scene.images(list(self.cams), range(first, first + self.n_steps)) for first in self.first]

@@ -20,7 +20,7 @@ from gsim3d.errors import InputError
 from gsim3d.evaluate.protocol import Prediction, render_steps
 from gsim3d.evaluate.scoring import METRICS
 from gsim3d.io import write_ply, write_video
-from gsim3d.io.files import write_picture
+from gsim3d.io.files import whole_file, write_picture
 from gsim3d.io.particles import STATE, write_particles
 from gsim3d.io.sequence import write_about
 from gsim3d.io.terminal import progress
@@ -29,8 +29,8 @@ from gsim3d.train.restore import Restored
 from gsim3d.viewer.films import film_frames
 from gsim3d.viewer.player import View, write_player
 
-SPLAT_SIZE = 320  # pixels, height and width of the picture of the Gaussians
-SPLAT_SHRINK = 0.45  # of their scales there, so that single ones can be distinguished
+SPLAT_SIZE = 320  # pixels, height of the picture of the Gaussians
+SPLAT_SHRINK = 0.45  # factor of the scales in it, which makes single Gaussians visible
 CURVES = {  # method -> label, colour
     "model": ("model", "#1f5fbf"),
     "constant": ("constant (last encoded particles)", "#c0504d"),
@@ -43,12 +43,12 @@ CURVES = {  # method -> label, colour
 
 
 def as_bytes(images: Tensor) -> np.ndarray:
-    """Images in [0, 1] -> uint8."""
+    """Converts images in [0, 1] to uint8."""
     return (images * 255).round().to(torch.uint8).cpu().numpy()
 
 
 def true_images(scene: Scene, cams: Sequence[int], steps: Sequence[int]) -> np.ndarray:
-    """uint8 [S, V, H, W, 3]; black after the scene's last frame."""
+    """Returns recorded images, uint8 [S, V, H, W, 3]; black after the scene's last step."""
     known = [step for step in steps if step < scene.n_steps]
     images = np.zeros((len(steps), len(cams), scene.height, scene.width, 3), np.uint8)
     if known:
@@ -58,7 +58,7 @@ def true_images(scene: Scene, cams: Sequence[int], steps: Sequence[int]) -> np.n
 
 @torch.no_grad()
 def write_gaussians(folder: str | Path, restored: Restored, prediction: Prediction, fps: float) -> None:
-    """One .ply a step into ``folder``: step_0000.ply, ...; their rate in sequence.json."""
+    """Writes one .ply file per step (step_0000.ply, ...) and sequence.json with the frame rate into ``folder``."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     gaussians = restored.simulator.renderer(prediction.particles).to("cpu")
@@ -78,17 +78,21 @@ def write_prediction(
     player: bool = False,
     quiet: bool = True,
 ) -> None:
-    """Writes a prediction as images, video and Gaussians into ``folder``, which appears whole or not at all.
+    """Writes a prediction as images, video, Gaussians and state into ``folder``, which is moved into place at the end.
 
     Args:
-        cams: cameras to show.
-        first: step of the scene that the prediction begins with.
+        folder: folder to create.
+        restored: the model.
+        scene: the predicted scene.
+        prediction: the prediction.
+        cams: cameras to render.
+        first: step of the scene at which the prediction starts.
         player: also write player.html.
-        quiet: no progress bar.
+        quiet: hide the progress bar.
     """
     folder = Path(folder)
     steps = [prediction.particles.select_clouds([step]) for step in range(prediction.n_steps)]
-    steps = progress(steps, "drawing", unit="step", quiet=quiet)
+    steps = progress(steps, "rendering", unit="step", quiet=quiet)
     images = [as_bytes(render_steps(restored, step, scene, cams, first + i))[0] for i, step in enumerate(steps)]
     truth = true_images(scene, cams, range(first, first + len(images)))
     part = folder.with_name(f".{folder.name}.part")
@@ -121,7 +125,7 @@ def write_prediction(
 
 @torch.no_grad()
 def splat_picture(restored: Restored, prediction: Prediction, scene: Scene, cam: int, step: int) -> np.ndarray:
-    """The Gaussians of one step, drawn smaller than they are, on white, at a higher resolution than the images."""
+    """Renders the Gaussians of a step with reduced scales, on white, at a higher resolution than the images."""
     zoom = SPLAT_SIZE / scene.height
     device = prediction.particles.means.device
     camera = scene.cameras_at([cam], [step]).to(device)
@@ -138,10 +142,15 @@ def splat_picture(restored: Restored, prediction: Prediction, scene: Scene, cam:
 def write_overview(
     path: str | Path, restored: Restored, scene: Scene, prediction: Prediction, images: Tensor, cam: int
 ) -> None:
-    """One picture of the whole way: input views, Gaussians, predicted frames below true ones.
+    """Writes an overview picture: input views, Gaussians, and true above predicted frames.
 
     Args:
-        images: [S, H, W, 3] rendered from the prediction, as ``cam`` sees it.
+        path: file to write.
+        restored: the model.
+        scene: the predicted scene.
+        prediction: the prediction.
+        images: [S, H, W, 3], the prediction rendered from ``cam``.
+        cam: target camera.
     """
     plt = pyplot()
     last_given, n_steps = prediction.n_encoded - 1, prediction.n_steps
@@ -180,11 +189,13 @@ def write_overview(
 
 
 def write_curves(path: str | Path, summary: dict, fps: float | None, metrics: Sequence[str] = tuple(METRICS)) -> None:
-    """Metrics over time, given and predicted steps, of every method; the first with its deviation between scenes.
+    """Plots metrics of every method over time, and for the first method the deviation between scenes.
 
     Args:
-        fps: steps a second; None: the axis counts steps.
-        metrics: those of them that the summary has by step are drawn, a panel each.
+        path: file to write.
+        summary: report, see :func:`gsim3d.evaluate.report.summarize`.
+        fps: steps per second; None: the axis is in steps.
+        metrics: metrics to plot, if the summary has them by step.
     """
     plt = pyplot()
     methods, n_encoded = summary["methods"], summary["n_encoded_steps"]
@@ -218,7 +229,7 @@ def write_curves(path: str | Path, summary: dict, fps: float | None, metrics: Se
 
 
 def pyplot():
-    """matplotlib's pyplot without a display. Raises InputError where matplotlib is not installed."""
+    """Imports matplotlib's pyplot without a display. Raises InputError if matplotlib is not installed."""
     try:
         import matplotlib
     except ImportError:
@@ -228,8 +239,6 @@ def pyplot():
 
 
 def _save(figure, path: str | Path) -> None:
-    path = Path(path)
-    part = path.with_name(f".{path.stem}.part{path.suffix}")
-    figure.savefig(part, dpi=110)
+    with whole_file(path) as part:
+        figure.savefig(part, dpi=110)
     pyplot().close(figure)
-    part.replace(path)

@@ -20,9 +20,9 @@ from gsim3d.data import Scene
 from gsim3d.data.images import IMAGE_SUFFIXES, as_color, read_files
 from gsim3d.data.recording import Problems
 from gsim3d.data.video_file import Video
+from gsim3d.data.videos import VIDEO_SUFFIXES
 from gsim3d.errors import InputError
 
-VIDEOS = (".mp4", ".webm", ".mov", ".mkv", ".avi")
 RESERVED = ("model", "constant", "copy", "constant_velocity", "release_constant", "perfect_ground", "perfect_body",
             "truth", "past", "future")  # fmt: skip
 
@@ -58,7 +58,7 @@ class Predictions:
     def cameras(self, scene: Scene) -> tuple[int, ...]:
         """Returns the cameras with predictions for ``scene``. Raises InputError if there are none."""
         folder = self._scene_folder(scene)
-        stems = {path.stem if path.suffix in VIDEOS else path.name for path in folder.iterdir()}
+        stems = {path.stem if path.suffix in VIDEO_SUFFIXES else path.name for path in folder.iterdir()}
         cams = sorted(int(match[1]) for stem in stems if (match := re.fullmatch(r"cam_(\d+)", stem)))
         if not cams:
             raise InputError(f"{folder}: contains neither a folder nor a video named cam_<number>")
@@ -117,10 +117,10 @@ def _find(path: Path, steps: range) -> Path | list[Path]:
     """Returns the video file, or the frame files of ``steps``."""
     if path.is_dir():
         return _frames(path, steps)
-    for suffix in VIDEOS:
+    for suffix in VIDEO_SUFFIXES:
         if (video := path.with_name(path.name + suffix)).is_file():
             return video
-    raise InputError(f"{path} is missing: a folder of frames, or a video {path.name}{VIDEOS[0]}")
+    raise InputError(f"{path} is missing: a folder of frames, or a video {path.name}{VIDEO_SUFFIXES[0]}")
 
 
 def _frames(folder: Path, steps: range) -> list[Path]:

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor, nn
 
 from gsim3d.cameras import Frames
-from gsim3d.cuda_graphs import Captured, of_prepared_state
+from gsim3d.cuda_graphs import Captured, fit, fixed_geometry, observing_geometry, of_prepared_state
 from gsim3d.dynamics import DynamicsConfig, concatenate
 from gsim3d.effects.plan import Plan
 from gsim3d.errors import CaptureError, InputError
@@ -237,7 +237,7 @@ class _Step:
         self._owner.meanwhile()
         while True:
             numbers = found.tolist()
-            if all([capacity.fits(found) for capacity, found in zip(self._capacities, numbers, strict=True)]):
+            if fit(self._capacities, numbers):
                 break
             self._graph = self._records = loss = errors = gradients = found = None  # frees memory before the capture
             grown = [c.grown(number, FACTOR) for c, number in zip(self._capacities, numbers, strict=True)]
@@ -318,13 +318,7 @@ class _Step:
     @torch.no_grad()
     def _observed(self) -> list[PyramidCapacity]:
         """Observes the geometry sizes of each step; returns capacities with a margin."""
-        needed = []
-
-        def geometry(history: Particles) -> Pyramid:
-            pyramid = self._owner.simulator.dynamics.geometry(history)
-            needed.append(PyramidCapacity.of(pyramid, self._owner.simulator.dynamics.capacity(history), FACTOR))
-            return pyramid
-
+        geometry, needed = observing_geometry(self._owner.simulator.dynamics, FACTOR)
         if self._n_future:
             with self._owner.simulator.dynamics.moving_at_most(self.moving):
                 self._rollout(self._encode(StabilityReport()), geometry, StabilityReport())
@@ -332,15 +326,10 @@ class _Step:
 
     def _given(self, report: StabilityReport) -> tuple:
         """Computes the step with geometry of the current capacities."""
-        sizes, found = iter(self._capacities), []
-
-        def geometry(history: Particles) -> Pyramid:
-            found.append(self._owner.simulator.dynamics.geometry(history, capacity=next(sizes)))
-            return found[-1]
-
+        geometry, found = fixed_geometry(self._owner.simulator.dynamics, self._capacities)
         with self._owner.simulator.dynamics.moving_at_most(self.moving):
             computed = self._compute(geometry, report)
-        return *computed, torch.stack([p.found for p in found]) if found else self._weights.new_empty(0)
+        return *computed, torch.stack(found) if found else self._weights.new_empty(0)
 
     def _capture(self) -> None:
         self._owner.captures += 1

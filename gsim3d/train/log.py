@@ -1,11 +1,10 @@
-"""What a run writes while it goes on: a line of JSON for each logged step, TensorBoard, a trace, the progress bar."""
+"""Logging of a run: JSON lines, TensorBoard, Weights & Biases, profiler traces and the progress bar."""
 
 from __future__ import annotations
 
 import io
 import json
 import math
-import os
 import resource
 import sys
 from collections.abc import Iterator
@@ -22,6 +21,7 @@ from gsim3d.data import Scene, make_frames
 from gsim3d.dynamics import concatenate
 from gsim3d.effects.plan import Plan
 from gsim3d.errors import InputError
+from gsim3d.io.files import whole_file
 from gsim3d.io.plain import is_number
 from gsim3d.simulator import Simulator
 from gsim3d.state import Gaussians, Particles
@@ -29,21 +29,21 @@ from gsim3d.train.config import DataConfig, PhaseConfig
 from gsim3d.train.samples import context_cameras, spread_views, subsampled
 
 LOG, BOARD = "metrics.jsonl", "tensorboard"
-MAX_LINE = 2**20  # bytes; what is longer is no entry
-MAX_LOG = 2**30  # bytes, of millions of steps
-VIDEO_MS = 80  # that a frame of a sample video is shown
+MAX_LINE = 2**20  # bytes; longer lines are not log entries
+MAX_LOG = 2**30  # bytes; enough for millions of steps
+VIDEO_MS = 80  # duration of a frame of a sample video
 TRACES = "profile"  # folder
-SKIPPED, WARM_UP, TRACED = 1, 1, 2  # steps of a trace; the first one of a run is like no other
+SKIPPED, WARM_UP, TRACED = 1, 1, 2  # steps before, warm-up and recorded steps of a trace
 
 
 class Log:
     """The log of a run folder.
 
     Attributes:
-        file: lines of JSON.
-        writes: whether this process is the one that writes.
-        board: TensorBoard while it is open, or None.
-        wandb: Weights & Biases while it is open, or None.
+        file: file of JSON lines.
+        writes: whether this process writes it.
+        board: TensorBoard logger while open, or None.
+        wandb: Weights & Biases logger while open, or None.
     """
 
     def __init__(self, out: Path, *, writes: bool = True):
@@ -53,10 +53,10 @@ class Log:
         self._stream = None
 
     def cut(self, step: int) -> None:
-        """Drops what was logged from ``step`` on: those steps will be repeated.
+        """Removes the entries from ``step`` on, which will be repeated.
 
         Raises:
-            InputError: the log is no file, or cannot be read or written.
+            InputError: the log is not a file, or cannot be read or written.
         """
         if not self.writes or not self.file.exists():
             return
@@ -64,20 +64,22 @@ class Log:
             raise InputError(f"{self.file}: cannot be read: it is not a file")
         if (size := self.file.stat().st_size) > MAX_LOG:
             raise InputError(f"{self.file}: has {size} bytes, a log has at most {MAX_LOG}; move it away")
-        part = self.file.with_name(f".{self.file.name}.part")
         try:
-            with open(self.file, "rb") as lines, open(part, "wb") as retained:
+            with whole_file(self.file) as part, open(self.file, "rb") as lines, open(part, "wb") as retained:
                 while line := lines.readline(MAX_LINE):
                     if _step_of(line) < step:
                         retained.write(line.rstrip(b"\r\n") + b"\n")
-            os.replace(part, self.file)
         except OSError as error:
-            part.unlink(missing_ok=True)
             raise InputError(f"{self.file}: cannot be cut to step {step}: {error.strerror}") from None
 
     @contextmanager
     def opened(self, *, tensorboard: bool = False, wandb: dict | None = None) -> Iterator[None]:
-        """Within it steps are written; also for TensorBoard, and with the settings ``wandb`` for Weights & Biases."""
+        """Context in which entries are written, optionally also to TensorBoard and Weights & Biases.
+
+        Args:
+            tensorboard: log to TensorBoard.
+            wandb: configuration of a Weights & Biases run. Default: none.
+        """
         if not self.writes:
             yield
             return
@@ -96,7 +98,7 @@ class Log:
         return [logger for logger in (self.board, self.wandb) if logger is not None]
 
     def write(self, entry: dict, machine: dict) -> None:
-        """Writes ``entry``, which follows from the configuration, and time and memory, which do not."""
+        """Writes ``entry``, which is reproducible, and ``machine``, time and memory, which are not."""
         if self._stream is not None:
             rounded = {name: round(value, 4) for name, value in machine.items()}
             try:
@@ -111,7 +113,7 @@ class Log:
 
 
 def _numbers(values: dict, prefix: str) -> Iterator[tuple[str, float]]:
-    """Name and value of all numbers of ``values``, nested ones and those of lists under their own names."""
+    """Flattens nested dicts and lists; yields names "prefix/key/..." and numbers."""
     for name, value in values.items():
         if isinstance(value, list):
             value = {str(i + 1): item for i, item in enumerate(value)}
@@ -122,10 +124,10 @@ def _numbers(values: dict, prefix: str) -> Iterator[tuple[str, float]]:
 
 
 class Wandb:
-    """A run of Weights & Biases with the settings ``config``; its environment variables say where it goes.
+    """Logger to Weights & Biases, controlled by its environment variables.
 
     Raises:
-        InputError: the package is not installed, or no run can be started.
+        InputError: the package is not installed, or a run cannot be started.
     """
 
     def __init__(self, out: Path, config: dict):
@@ -136,7 +138,7 @@ class Wandb:
         try:
             self._run = wandb.init(project="gsim3d", name=out.resolve().name, dir=str(out), config=config)
         except wandb.Error as error:
-            raise InputError(f"--wandb: {error}; WANDB_MODE=offline needs no account") from None
+            raise InputError(f"--wandb: {error}; set WANDB_MODE=offline to log without an account") from None
 
     def scalars(self, values: dict[str, float], step: int) -> None:
         self._run.log(values, step=step)
@@ -146,7 +148,7 @@ class Wandb:
 
 
 class Board:
-    """TensorBoard's files in ``folder``. Raises InputError where the package is not installed."""
+    """Logger to TensorBoard. Raises InputError if the package is not installed."""
 
     def __init__(self, folder: Path):
         try:
@@ -160,7 +162,7 @@ class Board:
             self._writer.add_scalar(name, value, step)
 
     def video(self, frames: Tensor, step: int) -> None:
-        """Shows ``frames``, uint8 [T, H, W, 3]."""
+        """Logs ``frames``, uint8 [T, H, W, 3], as an animated image."""
         from PIL import Image
         from tensorboard.compat.proto.summary_pb2 import Summary
 
@@ -182,11 +184,11 @@ class Sample:
     """A prediction of the first window of a scene.
 
     Attributes:
-        particles: one cloud a step.
-        gaussians: as they are rendered.
-        n_given: steps that were encoded.
-        scene: recorded; its steps from 0.
-        cam: whose images are compared.
+        particles: one cloud per step.
+        gaussians: decoded Gaussians.
+        n_given: number of encoded steps.
+        scene: the scene.
+        cam: camera of the sample video.
     """
 
     particles: Particles
@@ -200,7 +202,7 @@ class Sample:
 def draw_sample(
     simulator: Simulator, plan: Plan, scene: Scene, data: DataConfig, phase: PhaseConfig, device: str
 ) -> Sample:
-    """What ``simulator`` predicts of the first window of ``scene`` now."""
+    """Predicts the first window of ``scene`` with the current weights."""
     n_past, cams = phase.history or data.history, context_cameras(scene, data)
     frames = make_frames([scene], [spread_views(cams, data.context_views, 0)], [list(range(n_past))])
     with _evaluating(simulator):
@@ -221,7 +223,7 @@ def _evaluating(simulator: Simulator) -> Iterator[None]:
 
 @torch.no_grad()
 def sample_video(simulator: Simulator, plan: Plan, sample: Sample) -> Tensor:
-    """uint8 [T, H, 2 W, 3]: a sample seen by its camera, recorded and predicted."""
+    """Renders a sample next to the recorded images, uint8 [T, H, 2 W, 3]."""
     scene, steps, particles = sample.scene, range(sample.particles.n_clouds), sample.particles
     cameras = scene.cameras_at([sample.cam], steps).to(particles.means.device)
     with _evaluating(simulator):
@@ -231,7 +233,7 @@ def sample_video(simulator: Simulator, plan: Plan, sample: Sample) -> Tensor:
 
 
 def memory_gib(device: str) -> float:
-    """The most memory that was ever in use: tensors on a GPU, the whole process on a CPU."""
+    """Returns the peak memory: of tensors on a GPU, or of the process on a CPU."""
     if device == "cuda":
         return torch.cuda.max_memory_allocated() / 2**30
     unit = 1 if sys.platform == "darwin" else 1024
@@ -239,15 +241,15 @@ def memory_gib(device: str) -> float:
 
 
 def progress_note(entry: dict, machine: dict) -> str:
-    """What the progress bar says beside the steps, their rate and the time left."""
+    """Returns the postfix of the progress bar."""
     values = {name: entry.get(f"{name}_psnr") for name in ("past", "future")}
     parts = [f"{name} {value:.1f} dB" for name, value in values.items() if isinstance(value, float)]
-    parts += [f"{machine['step_seconds']:.2f} s a step", f"{machine['memory_gib']:.1f} GiB"]
+    parts += [f"{machine['step_seconds']:.2f} s/step", f"{machine['memory_gib']:.1f} GiB"]
     return ", ".join(parts + ["skipped"] * ("skipped" in entry))
 
 
 def plain(value: Any) -> Any:
-    """JSON has no NaN: what is not finite is logged as text."""
+    """Converts numbers that are not finite to strings, because JSON has no NaN."""
     if isinstance(value, dict):
         return {name: plain(item) for name, item in value.items()}
     if isinstance(value, list):
@@ -256,7 +258,7 @@ def plain(value: Any) -> Any:
 
 
 def read_entry(line: bytes) -> dict[str, Any] | None:
-    """A line of a log, or None: of a killed process the last one may be cut, and a disk may have changed others."""
+    """Parses a line of a log; returns None if it is truncated or damaged."""
     try:
         entry = json.loads(line)
     except (ValueError, RecursionError):
@@ -270,21 +272,20 @@ def _step_of(line: bytes) -> float:
 
 
 def check_profile(n_steps: int) -> None:
-    """Raises InputError where too few steps are left to trace."""
+    """Raises InputError if too few steps are left to trace."""
     if n_steps < SKIPPED + WARM_UP + TRACED:
         raise InputError(f"--profile traces steps 3 and 4 of a run; this one has {n_steps}")
 
 
 def profiler(out: Path, rank: int) -> profile:
-    """Writes ``out/profile/process_<rank>.json`` once its ``step`` was called often enough."""
+    """Returns a profiler that writes ``out/profile/process_<rank>.json`` after its traced steps."""
     folder = out / TRACES
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / f"process_{rank}.json"
 
     def write(traced: profile) -> None:
-        part = file.with_name(f".{file.stem}.part.json")
-        traced.export_chrome_trace(str(part))
-        os.replace(part, file)
+        with whole_file(file) as part:
+            traced.export_chrome_trace(str(part))
 
     activities = [ProfilerActivity.CPU] + [ProfilerActivity.CUDA] * torch.cuda.is_available()
     plan = schedule(wait=SKIPPED, warmup=WARM_UP, active=TRACED, repeat=1)

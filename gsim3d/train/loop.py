@@ -408,7 +408,7 @@ class Trainer:
         return images
 
     def draw_sample(self, scene: Scene | None = None) -> Sample:
-        """What is predicted of the first window of ``scene``, or of the first scene, now."""
+        """Predicts the first window of ``scene`` (default: the first scene) with the current weights."""
         phase, _ = self.config.phase_of(max(0, min(self.step, self.config.n_steps) - 1))
         return draw_sample(self.simulator, self.plan, scene or self.scenes[0], self.config.data, phase, self.device)
 

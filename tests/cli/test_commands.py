@@ -173,7 +173,7 @@ def broken_scene(work, tmp_path, name):
 BAD = {
     "unknown command": (["trian"], "unknown command 'trian'"),
     "unknown option": (["train", "--speed", "9"], "unrecognized arguments: --speed"),
-    "no configuration": (["train", "--data", "{data}", "--out", "{new}"], "CONFIG is needed"),
+    "no configuration": (["train", "--data", "{data}", "--out", "{new}"], "CONFIG is required"),
     "configuration is missing": (["train", "no.yaml", "--data", "{data}", "--out", "{new}"], "no.yaml cannot be read"),
     "data is missing": (["train", "{config}", "--data", "{new}/data", "--out", "{new}"], "data"),
     "no scene": (["train", "{config}", "--data", "{empty}", "--out", "{new}"], "contains no scene"),

@@ -225,7 +225,7 @@ def test_several_steps_at_once():
     assert read.model.dynamics.steps_per_call == 2
     assert "dataset.n_step_predict_multiple is 1, but the weights have 2, which is used" in read.notes
     shapes[f"{DYNAMICS}dec.2.fc2.weight"] = (15, 8)
-    with pytest.raises(InputError, match="predicts 15 numbers a particle, but a step of this variant takes 7"):
+    with pytest.raises(InputError, match="predicts 15 values per particle, but a step of this variant needs 7"):
         read_config(settings, shapes)
 
 

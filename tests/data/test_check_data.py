@@ -54,7 +54,7 @@ def test_check_data_lists_every_problem_of_every_scene(data, capsys):
 def test_check_data_writes_nothing_without_out(data, capsys, monkeypatch):
     monkeypatch.chdir(data.parent)
     assert main(["check-data", "data"]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == "3 scenes read, no problem; --out draws a picture of the cameras"
+    assert capsys.readouterr().out.splitlines()[-1] == "3 scenes read, no problem; use --out to draw a contact sheet"
     assert [path.name for path in data.parent.iterdir()] == ["data"]
 
 
@@ -71,7 +71,7 @@ def test_check_data_quiet_prints_problems_only(data, capsys):
 def test_check_data_without_readable_scene_draws_nothing(tmp_path, capsys):
     (tmp_path / "cameras.json").write_text("[]")
     assert main(["check-data", str(tmp_path), "--out", str(tmp_path / "sheet.png")]) == 1
-    assert "no scene could be drawn" in capsys.readouterr().out and not (tmp_path / "sheet.png").exists()
+    assert "no scene could be opened" in capsys.readouterr().out and not (tmp_path / "sheet.png").exists()
 
 
 @pytest.mark.parametrize(

@@ -63,9 +63,9 @@ def test_uneven_videos_are_resampled_on_request(tmp_path, suffix):
     times = np.cumsum([0, *UNEVEN]) / 1000
     wanted = [int(np.argmin(np.abs(times - step / 4))) for step in range(scene.n_steps)]
     assert scene.fps == 4 and scene.n_steps == 12 and frames_of(scene) == [wanted]
-    assert "resampled: frames lie up to" in describe(scene)
+    assert "resampled: frames are up to" in describe(scene)
     twice = Scene.open(write_scene(tmp_path, ["a"], resample=8))
-    assert twice.fps == 8 and "9 of 24 steps show the frame before again" in describe(twice)
+    assert twice.fps == 8 and "9 of 24 steps repeat the previous frame" in describe(twice)
     for value in (0, -1, "4", 1e9):
         with pytest.raises(InputError, match="resample"):
             Scene.open(write_scene(tmp_path, ["a"], resample=value))
@@ -158,7 +158,7 @@ def test_videos_of_different_rates_are_refused(tmp_path):
     write_plain(tmp_path / "a.mp4")
     write_plain(tmp_path / "b.webm", n_frames=30, rate=30)
     for keys in ({}, {"fps": 20}):
-        with pytest.raises(InputError, match=r"20 \(camera a\) and 30 \(camera b\) frames a second.*resample"):
+        with pytest.raises(InputError, match=r"20 \(camera a\) and 30 \(camera b\) frames per second.*resample"):
             Scene.open(write_scene(tmp_path, ["a", "b"], **keys))
     scene = Scene.open(write_scene(tmp_path, ["a", "b"], resample=10))
     assert scene.fps == 10 and frames_of(scene) == [list(range(0, 20, 2)), [number % 20 for number in range(0, 30, 3)]]
@@ -168,7 +168,7 @@ def test_fps_replaces_the_rate_of_even_videos(tmp_path):
     """Slow motion is stored at the rate at which it is played."""
     write_plain(tmp_path / "a.mp4")
     scene = Scene.open(write_scene(tmp_path, ["a"], fps=240))
-    assert (scene.n_steps, scene.fps) == (20, 240) and "20 frames a second are taken to have 240" in describe(scene)
+    assert (scene.n_steps, scene.fps) == (20, 240) and "20 per second, is replaced by fps: 240" in describe(scene)
     (tmp_path / "b").mkdir()
     for number in range(20):
         cv2.imwrite(str(tmp_path / "b" / f"{number}.png"), np.zeros((48, 64, 3), np.uint8))

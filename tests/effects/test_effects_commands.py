@@ -23,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def test_plan_command_lists_effects_and_costs(capsys, work):  # noqa: F811
     scene = work / "data" / "ball" / "0000"
     code, out, _ = call(capsys, "plan", scene, work / "run")
-    assert code == 0 and re.search(r"ball/0000: \d+ moving and \d+ frozen particles a step, 1 image of 32x32", out)
+    assert code == 0 and re.search(r"ball/0000: \d+ moving and \d+ frozen particles per step, 1 image of 32x32", out)
     assert re.search(r"^history +switch +2 steps$", out, re.MULTILINE)
     assert re.search(r"^rgb +output +image$", out, re.MULTILINE) and not re.search("^depth", out, re.MULTILINE)
     assert re.search(r"^parameters not needed: 0 of \d+", out, re.MULTILINE) and "the checkpoint's" in out

@@ -235,7 +235,7 @@ def test_command_lists_rows_and_refuses_wrong_input(folders, tmp_path, capsys):
         ([data, "--seeds", "0", "--out", out], "--seeds: must be at least 1"),
         ([data, "--together", "0", "--out", out], "--together: must be at least 1"),
         ([data, "--minutes", "0", "--out", out], "--minutes: must be a finite number above 0; got 0"),
-        ([data], "--out is needed"),
+        ([data], "--out is required"),
         ([str(folders[0]), "--out", out], "at least two are needed"),
         ([data, "--config", str(tmp_path / "long.yaml"), "--out", out], "row latent: "),
     ):

@@ -73,7 +73,7 @@ def test_changes_of_a_reader_are_reported(restored, tmp_path):
     trimmed(tmp_path / "b.mp4", 0.0, late=0.3)
     folder = write_videos(tmp_path, ["a", "b"], resample=12)
     said = opened(restored, folder)[1]
-    assert f"{folder}: resampled: frames lie up to" in said
+    assert f"{folder}: resampled: frames are up to" in said
 
 
 @pytest.mark.parametrize("n_cams", VIEWS)

@@ -78,7 +78,7 @@ class LPIPS(nn.Module):
         self.layers = NETWORKS[network]
         widths = [3] + [layer.channels for layer in self.layers]
         self.convs = nn.ModuleList(
-            nn.Conv2d(width, layer.channels, layer.kernel, layer.stride, _padding(layer))
+            nn.Conv2d(width, layer.channels, layer.kernel, layer.stride, 2 if layer.stride == 4 else layer.kernel // 2)
             for width, layer in zip(widths, self.layers)
         )
         self.heads = nn.ParameterList(nn.Parameter(torch.zeros(layer.channels)) for layer in self.layers if layer.tap)
@@ -103,10 +103,6 @@ class LPIPS(nn.Module):
             if layer.tap:
                 taps.append(x)
         return taps
-
-
-def _padding(layer: _Conv) -> int:
-    return 2 if layer.stride == 4 else layer.kernel // 2
 
 
 def _unit(features: Tensor) -> Tensor:
