@@ -193,7 +193,7 @@ BAD = {
     "no such camera": (["simulate", "{run}", "{scene}", "--out", "{new}", "--cameras", "9"], "camera 9 does not exist"),
     "no such context camera": (["simulate", "{run}", "{scene}", "--out", "{new}", "--context", "-1"], "at least 0"),
     "no step": (["simulate", "{run}", "{scene}", "--out", "{new}", "--steps", "0"], "at least 1"),
-    "start too late": (["simulate", "{run}", "{scene}", "--out", "{new}", "--start", "5"], "do not fit"),
+    "start too late": (["simulate", "{run}", "{scene}", "--out", "{new}", "--start", "5"], "needs 2 steps from step 5"),
     "not a number": (["simulate", "{run}", "{scene}", "--out", "{new}", "--steps", "many"], "invalid int value"),
     "no out": (["simulate", "{run}", "{scene}"], "required: --out"),
     "broken metadata": (["simulate", "{run}", "{metadata}", "--out", "{new}"], "metadata.json cannot be read"),

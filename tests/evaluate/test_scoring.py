@@ -90,7 +90,7 @@ def test_help_names_every_metric(capsys):
     with pytest.raises(SystemExit):
         main(["evaluate", "--help"])
     text = capsys.readouterr().out
-    assert all(metric in text.split("Measured are")[1] for metric in METRICS)
+    assert all(metric in text.split("Metrics:")[1] for metric in METRICS)
 
 
 def test_fvd_compares_the_predicted_steps_of_all_scenes_and_views(cheap_features):

@@ -51,12 +51,12 @@ def test_signal_saves_and_resumed_run_equals_uninterrupted(folder, tmp_path, cap
     before = [signal.getsignal(number) for number in SIGNALS]
     for step, number in enumerate(SIGNALS):
         trainer = signalled(Trainer(CONFIG, scenes(folder), tmp_path / "parts"), step, number)
-        said = f"{number.name}: step {step + 1} of 6 is saved in .*; the same command goes on"
+        said = f"{number.name}: step {step + 1} of 6 is saved in .*; run the same command to resume"
         with pytest.raises(RunStopped, match=said) as stopped:
             trainer.run(progress=False)
         assert stopped.value.code == 128 + number
         assert checkpoint.load(tmp_path / "parts").state["step"] == step + 1
-        assert f"{number.name}: ends after this step" in capfd.readouterr().err
+        assert f"{number.name}: stopping after this step" in capfd.readouterr().err
     assert [signal.getsignal(number) for number in SIGNALS] == before
     Trainer(CONFIG, scenes(folder), tmp_path / "parts").run(progress=False)
     assert curve(tmp_path / "parts") == curve(tmp_path / "whole")
@@ -99,7 +99,7 @@ def test_out_of_memory_is_one_line(folder, tmp_path, monkeypatch, capsys, name, 
     assert __main__.main(command) == 2
     said = capsys.readouterr().err.strip().splitlines()[-1]
     assert said.startswith("gsim3d: error: ") and "out of memory" in said and len(said) < 500
-    assert ("step 0: " in said and "smaller batch" in said) == (place == "train_step")
+    assert ("step 0: " in said and "reduce batch" in said) == (place == "train_step")
 
 
 def test_other_errors_of_torch_are_not_hidden(monkeypatch):
