@@ -146,7 +146,7 @@ class Trainer:
             tensorboard: also log for TensorBoard, with a sample video at each checkpoint.
             wandb: also log for Weights & Biases.
             watch: called by the first process with a sample and the step, before the first step and at each checkpoint.
-            watched: scene of that sample; None: the first one.
+            watched: scene of that sample. Default: the first training scene.
             profile: write a trace of two steps.
 
         Raises:

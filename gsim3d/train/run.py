@@ -46,8 +46,8 @@ def train(
         export: .safetensors file to export the result to; None: no export.
         tensorboard: also log to OUT/tensorboard.
         wandb: also log for Weights & Biases.
-        viewer: opens what is to be called with samples, see :meth:`gsim3d.train.loop.Trainer.run`.
-        held_out: scenes that are not trained on; the viewer shows the first, or without any one of ``folders``.
+        viewer: returns a context manager whose value is called with samples, see ``watch`` of :meth:`Trainer.run`.
+        held_out: held-out scene folders; the viewer shows the first, or a training scene if there are none.
         profile: write a trace of two steps to OUT/profile.
 
     Raises:

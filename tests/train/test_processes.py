@@ -169,7 +169,7 @@ def test_shares_cover_the_batch():
 def test_batches_that_cannot_be_shared_are_refused(folder, tmp_path):
     with pytest.raises(InputError, match=r"phases\[0\].batch: must be at least the 3 processes; got 2"):
         Trainer(LAYER, scenes(folder), tmp_path, processes=Processes(0, 3))
-    with pytest.raises(InputError, match="workers: must be 0 in 2 processes"):
+    with pytest.raises(InputError, match="workers: must be 0 with 2 processes"):
         Trainer(dataclasses.replace(LAYER, workers=2), scenes(folder), tmp_path, processes=Processes(0, 2))
 
 

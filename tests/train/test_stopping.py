@@ -200,7 +200,9 @@ def test_process_without_partner_ends_with_one_line(tmp_path, gone, signal_of_on
             process.wait()
     said = (tmp_path / f"log_{1 - gone}").read_text().strip()
     assert said.count("\n") == 0
-    assert said.startswith(f"gsim3d: error: process {gone} of this run has ended or does not answer; start the command")
+    assert said.startswith(
+        f"gsim3d: error: process {gone} of this run has ended or does not answer; run the command again"
+    )
 
 
 def test_signal_of_one_process_stops_all(folder, tmp_path):
