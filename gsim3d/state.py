@@ -288,7 +288,7 @@ class Particles(TensorRecord):
         return self.known
 
     def with_clouds(self, table: CloudTable, **fields: Tensor) -> Particles:
-        """Returns particles with another cloud table and other ``fields``."""
+        """Returns particles with the cloud table ``table`` and other ``fields``."""
         cu_rows, scene, step = table.tensors
         return dataclasses.replace(self, **fields, cu_rows=cu_rows, cloud_scene=scene, cloud_step=step, known=table)
 

@@ -68,11 +68,7 @@ class Imported:
 
 
 def import_released(path: str | Path, settings: dict) -> Imported:
-    """Reads and converts a published checkpoint.
-
-    Args:
-        path: checkpoint file.
-        settings: content of its resolved YAML file.
+    """Reads and converts a published checkpoint with the settings of its resolved YAML file.
 
     Raises:
         InputError: the file is of another kind or could run code, a setting is not supported, or tensors are missing or

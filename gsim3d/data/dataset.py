@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -138,18 +138,11 @@ def _cams_per_step(cams, n_steps: int, scene: Scene) -> list[list[int]]:
 
 
 def _join_cameras(cameras: list[Cameras], image_cloud: list[int]) -> Cameras:
-    return Cameras(
-        viewmats=torch.cat([c.viewmats for c in cameras]),
-        Ks=torch.cat([c.Ks for c in cameras]),
-        near=torch.cat([c.near for c in cameras]),
-        far=torch.cat([c.far for c in cameras]),
-        image_cloud=torch.tensor(image_cloud, dtype=torch.int64),
-        width=cameras[0].width,
-        height=cameras[0].height,
-    )
+    joined = {name: torch.cat([getattr(c, name) for c in cameras]) for name in ("viewmats", "Ks", "near", "far")}
+    return dataclasses.replace(cameras[0], **joined, image_cloud=torch.tensor(image_cloud, dtype=torch.int64))
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Window:
     """Consecutive steps of one scene: ``n_context`` input steps, followed by steps to predict.
 

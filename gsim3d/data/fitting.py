@@ -26,11 +26,7 @@ def frame_stride(rate: float, wanted: float) -> int | None:
 
 
 def resample(recording: Recording, fps: float) -> Recording:
-    """Subsamples ``recording`` in time to ``fps`` frames per second.
-
-    Raises:
-        InputError: the recording's rate is not an integer multiple of ``fps``.
-    """
+    """Subsamples ``recording`` to ``fps``; raises InputError if its rate is not an integer multiple of ``fps``."""
     if recording.n_steps == 1:
         return recording
     stride = frame_stride(recording.fps, fps)
@@ -78,11 +74,7 @@ class Fitting:
 
 
 def fit(recording: Recording, fitting: Fitting) -> Recording:
-    """Returns ``recording`` converted as ``fitting`` specifies.
-
-    Raises:
-        InputError: images are smaller than ``fitting.size`` and ``fitting.enlarge`` is off.
-    """
+    """Converts ``recording``; raises InputError if images are smaller than ``fitting.size`` without ``enlarge``."""
     if fitting.unit_cameras:
         recording = _in_units_of_cameras(recording)
     if fitting.size is not None and any(size != fitting.size for size in recording.sizes):

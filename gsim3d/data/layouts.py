@@ -18,11 +18,7 @@ MAX_DEPTH = 3  # levels of subfolders that are searched
 
 
 def layout_of(folder: str | Path) -> ModuleType:
-    """Returns the layout module of a scene folder.
-
-    Raises:
-        InputError: no layout recognises the folder.
-    """
+    """Returns the layout module of a scene folder. Raises InputError if no layout recognises it."""
     found = _find(Path(folder))
     if found is None:
         raise InputError(f"{folder} is not a scene folder: it has no {_files()} (see docs/reference/data.md)")

@@ -65,14 +65,7 @@ class Row:
 
 
 def load_ablations(path: Path = PAPER) -> tuple[dict[str, TrainConfig], dict[str, Row]]:
-    """Reads an ablation file.
-
-    Returns:
-        Base runs by preset, and rows by name.
-
-    Raises:
-        InputError: the file does not exist or is not an ablation file.
-    """
+    """Reads (base runs by preset, rows by name) from an ablation file; raises InputError if it is invalid."""
     if not path.is_file():
         raise InputError(f"{path}: does not exist; --table takes a file like configs/ablations/paper.yaml")
     content = read_yaml(path)
@@ -129,13 +122,7 @@ def base_run(
     config: str | Path | None = None,
     n_steps: int | None = None,
 ) -> TrainConfig:
-    """Returns the base run of a preset or of a ``gsim3d train`` configuration file.
-
-    Args:
-        bases: base runs by preset.
-        preset: name of a base run. Default: PRESET.
-        config: configuration file, instead of ``preset``.
-        n_steps: optimizer steps. Default: those of the configuration.
+    """Returns the base run of a preset or of a ``gsim3d train`` configuration file, in ``n_steps`` optimizer steps.
 
     Raises:
         InputError: the preset is unknown, or both ``preset`` and ``config`` are given.
@@ -224,7 +211,7 @@ class Study:
         progress: bool = True,
         say: Callable[[str], None] = print,
     ) -> dict:
-        """Trains and scores all runs that are not finished yet.
+        """Trains and scores all runs that are not finished yet; returns the content of ablation.json.
 
         Args:
             out: folder of the runs, ablation.json and ablation.md; the tables are rewritten after every run.
@@ -233,9 +220,6 @@ class Study:
             minutes: time limit for training; the next call resumes.
             progress: show progress bars.
             say: called with a line for each finished run.
-
-        Returns:
-            The content of ablation.json.
         """
         end = time.monotonic() + 60 * minutes
         out.mkdir(parents=True, exist_ok=True)
@@ -337,13 +321,7 @@ def _begin(n_threads: int) -> None:
 
 
 def as_dict(study: Study, results: dict[str, list[dict]], command: str) -> dict:
-    """Builds the content of ablation.json: runs, means, and differences from the first row, for each row.
-
-    Args:
-        study: the study.
-        results: finished runs by the name of their row.
-        command: command line to record.
-    """
+    """Builds the content of ablation.json: for each row its runs, means, and differences from the first row."""
     rows = []
     for row in study.rows:
         same = study.same_as(row.name)

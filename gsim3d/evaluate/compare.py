@@ -33,8 +33,6 @@ def compare(report: dict, other: dict, file: str | Path) -> dict:
     """Subtracts the scores of ``other`` from those of ``report``, for the first method of each.
 
     Args:
-        report: a report, see :func:`read_report`.
-        other: the report to compare with.
         file: file of ``other``, for messages.
 
     Returns:
@@ -81,8 +79,7 @@ def check_same(steps: dict, names: Iterable[str], other: dict, where: str | Path
     Args:
         steps: n_encoded_steps and n_future_steps.
         names: names of the scenes.
-        other: the other report.
-        where: file of the other report, for messages.
+        where: file of ``other``, for messages.
     """
     for key, what in SAME.items():
         if steps.get(key) != other.get(key):

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import resource
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -25,6 +23,7 @@ from gsim3d.io.locks import only_one_writer
 from gsim3d.io.terminal import progress as shown
 from gsim3d.synth import generate
 from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, PhaseConfig, TrainConfig
+from gsim3d.train.log import memory_gib
 from gsim3d.train.loop import Trainer
 from gsim3d.train.restore import restore
 from gsim3d.viewer.films import film_frames
@@ -215,11 +214,5 @@ def _report(out: Path, summary: dict, seconds: dict, now: float) -> None:
         print(f"{what + ':':52}{model:7.2f} dB, baseline {baseline:.2f} dB: {margin}")
     parts = ", ".join(f"{name} {value:.0f}" for name, value in seconds.items())
     in_all = f"{sum(seconds.values()):.0f} in total, {now:.0f} in this run"
-    print(f"\nseconds: {parts}; {in_all}; peak memory {_peak_gib():.1f} GiB")
+    print(f"\nseconds: {parts}; {in_all}; peak memory {memory_gib('cpu'):.1f} GiB")
     print(f"open {out / 'rollout.mp4'} and {out / 'overview.png'}")
-
-
-def _peak_gib() -> float:
-    """Returns the peak memory of this process plus its largest child, in GiB."""
-    unit = 2**30 if sys.platform == "darwin" else 2**20
-    return sum(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / unit

@@ -59,13 +59,7 @@ def infer(restored: Restored, scene: Scene, tolerance: float, progress: Callable
     """Finds the smallest spec that loses at most ``tolerance`` dB on ``scene``.
 
     Args:
-        restored: the model.
-        scene: scene to predict and compare with.
-        tolerance: largest loss of PSNR in dB.
         progress: function number of settings -> context manager of a progress bar.
-
-    Returns:
-        The spec and all measurements.
     """
     base = restored.plan.spec
     settings = smaller_settings(base, restored.simulator.config)
@@ -107,11 +101,8 @@ def propose(
     or the smallest speed-up is restored.
 
     Args:
-        base: the spec to reduce.
-        settings: smaller settings of each effect, see :func:`smaller_settings`.
         trial: measures a spec.
         before: measurement of ``base``.
-        tolerance: largest loss of PSNR in dB.
 
     Returns:
         Table of all settings, the chosen spec, and its measurement.
@@ -156,13 +147,7 @@ def combined(base: EffectsSpec, specs: Iterable[EffectsSpec]) -> EffectsSpec:
 
 
 class Trial:
-    """Measures specs: PSNR of short predictions, and seconds per step including its images.
-
-    Args:
-        restored: the model.
-        scene: scene to predict and compare with.
-        bar: progress bar, advanced by each measurement.
-    """
+    """Measures specs: PSNR of short predictions, and seconds per step with images; each advances ``bar``."""
 
     def __init__(self, restored: Restored, scene: Scene, bar):
         self.restored, self.scene, self.bar, n_encoded = restored, scene, bar, restored.data.history

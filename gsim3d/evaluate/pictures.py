@@ -81,10 +81,6 @@ def write_prediction(
     """Writes a prediction as images, video, Gaussians and state into ``folder``, which is moved into place at the end.
 
     Args:
-        folder: folder to create.
-        restored: the model.
-        scene: the predicted scene.
-        prediction: the prediction.
         cams: cameras to render.
         first: step of the scene at which the prediction starts.
         player: also write player.html.
@@ -145,12 +141,7 @@ def write_overview(
     """Writes an overview picture: input views, Gaussians, and true above predicted frames.
 
     Args:
-        path: file to write.
-        restored: the model.
-        scene: the predicted scene.
-        prediction: the prediction.
         images: [S, H, W, 3], the prediction rendered from ``cam``.
-        cam: target camera.
     """
     plt = pyplot()
     last_given, n_steps = prediction.n_encoded - 1, prediction.n_steps
@@ -192,8 +183,6 @@ def write_curves(path: str | Path, summary: dict, fps: float | None, metrics: Se
     """Plots metrics of every method over time, and for the first method the deviation between scenes.
 
     Args:
-        path: file to write.
-        summary: report, see :func:`gsim3d.evaluate.report.summarize`.
         fps: steps per second; None: the axis is in steps.
         metrics: metrics to plot, if the summary has them by step.
     """

@@ -51,9 +51,6 @@ class PartTimes:
 
         Args:
             own: plan of the checkpoint, with which the times were measured.
-            plan: plan to predict.
-            model: configuration of the model.
-            work: workload to predict.
         """
         before, after = predicted_cost(own, model, self.work), predicted_cost(plan, model, work)
         scaled = {part: getattr(self, part) * after[part] / max(before[part], 1.0) for part in after}
@@ -84,11 +81,7 @@ def plan_report(
     """Yields the paragraphs of the report: active parts, unused parameters, and predicted costs of a step.
 
     Args:
-        simulator: the model.
-        plan: plan to report.
-        work: workload of a step.
-        times: device -> times measured with the plan ``own``.
-        own: plan of the checkpoint.
+        times: device -> times measured with the checkpoint's plan ``own``.
     """
     switches = [(name, "switch", setting) for name, setting in plan.switches]
     priors = [(name, "prior", f"number {n} of {len(plan.priors)}") for n, name in enumerate(plan.priors, 1)]

@@ -74,19 +74,11 @@ class Prediction:
 def default_views(
     restored: Restored, scene: Scene, context: Sequence[int] | None = None, target: Sequence[int] | None = None
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Chooses input and target cameras where they are not given.
+    """Returns (context, target) cameras; raises InputError if too few are left as inputs.
 
     Args:
-        restored: the model.
-        scene: the scene.
         context: input cameras. Default: as many as in training, evenly spaced, without ``target``.
         target: target cameras. Default: those that training excluded from inputs, else all that are not inputs.
-
-    Returns:
-        (context, target) cameras.
-
-    Raises:
-        InputError: too few cameras are left as inputs.
     """
     data = restored.data_of(scene)
     if not context:
@@ -139,20 +131,7 @@ def predict(
     edits: Sequence[Edit] = (),
     on_steps: Callable[[int], object] | None = None,
 ) -> Prediction:
-    """Encodes the input steps of a scene from ``start`` and predicts ``n_future`` steps, also past its last frame.
-
-    Args:
-        restored: the model.
-        scene: scene to predict.
-        context_cams: input cameras.
-        n_future: number of steps to predict.
-        start: first input step.
-        edits: edits to apply during the rollout.
-        on_steps: called with the number of steps just simulated.
-
-    Raises:
-        InputError: the image size differs from training, a camera or step does not exist, or an edit is invalid.
-    """
+    """Predicts one scene, see :func:`predict_together`."""
     options = {"start": start, "edits": edits, "on_steps": on_steps}
     return predict_together(restored, [scene], n_future, [context_cams], **options)[0]
 
@@ -179,7 +158,7 @@ def predict_together(
     edits: Sequence[Edit] = (),
     on_steps: Callable[[int], object] | None = None,
 ) -> list[Prediction]:
-    """Predicts several scenes in one batched rollout, see :func:`predict`.
+    """Encodes the input steps of scenes from ``start`` and predicts them in one rollout, also past their last frame.
 
     Args:
         restored: the model.
@@ -189,6 +168,9 @@ def predict_together(
         start: first input step.
         edits: edits to apply during the rollout.
         on_steps: called with the number of steps just simulated.
+
+    Raises:
+        InputError: the image size differs from training, a camera or step does not exist, or an edit is invalid.
     """
     _check_count(n_future)
 
@@ -218,7 +200,7 @@ def predict_together(
 
 
 def encode_steps(restored: Restored, scene: Scene, context_cams: Sequence[int], start: int = 0) -> Particles:
-    """Encodes the input steps of a scene from ``start``. Raises as :func:`predict`."""
+    """Encodes the input steps of a scene from ``start``."""
     return _encode(restored, [scene], [context_cams], start)
 
 
@@ -232,11 +214,7 @@ def _encode(
 def input_frames(
     restored: Restored, scenes: Sequence[Scene], contexts: Sequence[Sequence[int]], start: int = 0
 ) -> Frames:
-    """Packs the input images of scenes from step ``start``; the simulator's setting may reduce the number of views.
-
-    Raises:
-        InputError: as :func:`predict`.
-    """
+    """Packs the input images of scenes from step ``start``; the simulator's setting may reduce the number of views."""
     n_encoded, most = restored.n_encoded, restored.simulator.setting.context_views
     for scene in scenes:
         restored.check_scene(scene)

@@ -55,17 +55,9 @@ class Description:
 def load(
     kinds: Sequence[type[Model]], name_or_path: str | Path, device: str, speed: str
 ) -> tuple[Model, checkpoint.Checkpoint]:
-    """Loads the simulator of a checkpoint, see :meth:`gsim3d.Simulator.from_pretrained`.
+    """Loads a simulator of one of the classes ``kinds``, and its checkpoint.
 
-    Args:
-        kinds: simulator classes that may be loaded.
-        name_or_path, device, speed: see :meth:`gsim3d.Simulator.from_pretrained`.
-
-    Returns:
-        The simulator and its checkpoint.
-
-    Raises:
-        InputError: as :meth:`gsim3d.Simulator.from_pretrained`; the message starts with ``name_or_path``.
+    Other arguments and errors: see :meth:`gsim3d.Simulator.from_pretrained`.
     """
     check_device(device)
     saved = checkpoint.load(name_or_path)
@@ -129,10 +121,9 @@ def describe(config: dict[str, Any], kind: type[ModelConfig] = ModelConfig, fps:
 
 
 def build(make: Callable[[ModelConfig], Model], config: ModelConfig, seed: int = 0) -> Model:
-    """Builds a simulator with weights initialised from ``seed``; preserves torch's random state.
+    """Builds a simulator with weights initialised from ``seed``; raises InputError if sizes are not valid.
 
-    Raises:
-        InputError: the sizes are not valid.
+    torch's random state is preserved.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

@@ -183,11 +183,7 @@ def keep_jacobian(simulator: Simulator, saved: dict) -> None:
 
 
 def build_simulator(config: ModelConfig, seed: int) -> Simulator:
-    """Builds a simulator with weights initialised from ``seed``; preserves torch's random state.
-
-    Raises:
-        InputError: ``config`` is not a valid model.
-    """
+    """Builds a simulator, see :func:`gsim3d.pretrained.loading.build`."""
     return loading.build(simulator_class(config), config, seed)
 
 
@@ -205,11 +201,7 @@ def describe(config: TrainConfig, model: ModelConfig, scene: Scene, effects: Eff
 def restore(path: str | Path, device: str = "cpu", speed: str = "exact") -> Restored:
     """Loads a simulator, also of the published model, with its training settings.
 
-    Args:
-        path, device, speed: see :meth:`gsim3d.Simulator.from_pretrained`.
-
-    Raises:
-        InputError: as :meth:`gsim3d.Simulator.from_pretrained`, or the data settings are not valid in this version.
+    Arguments and errors: see :meth:`gsim3d.Simulator.from_pretrained`.
     """
     simulator, saved = loading.load((Simulator, ReleasedSimulator), path, device, speed)
     data = {key: value for key, value in current_data(saved.config["data"]).items() if key not in ("image_size", "fps")}

@@ -37,9 +37,6 @@ def train(
     """Trains on the scenes in ``folders`` and writes the run folder ``out``.
 
     Args:
-        config: the training.
-        folders: scene folders.
-        out: run folder.
         cache: folder to cache decoded images in; None caches them in memory.
         device: "cpu" or "cuda".
         until: optimizer step to stop after; None: the last one.
