@@ -235,11 +235,7 @@ def spread_steps(values: np.ndarray) -> np.ndarray:
 
 
 def project(points: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Projects world points [N, 3] with viewmats [..., 4, 4] and Ks [..., 3, 3].
-
-    Returns:
-        Pixels [..., N, 2] and depths [..., N].
-    """
+    """Projects world points [N, 3] with viewmats [..., 4, 4], Ks [..., 3, 3] to pixels [..., N, 2], depths [..., N]."""
     local = points @ viewmats[..., :3, :3].swapaxes(-1, -2) + viewmats[..., None, :3, 3]
     image = local @ Ks.swapaxes(-1, -2)
     depth = local[..., 2]

@@ -19,14 +19,11 @@ MAX_HOLE = 0.005  # fraction of the image; smaller holes are filled
 
 
 def median_image(read: Callable[[Sequence[int]], np.ndarray], n_steps: int) -> np.ndarray:
-    """Estimates the background of a static camera as the median image over at most MEDIAN_STEPS steps.
+    """Estimates the background, uint8 [h, w, 3], of a static camera as its median over at most MEDIAN_STEPS steps.
 
     Args:
         read: function steps -> uint8 [S, h, w, 3].
         n_steps: number of steps recorded.
-
-    Returns:
-        uint8 [h, w, 3].
     """
     steps = evenly_spaced(n_steps, MEDIAN_STEPS)
     frames = read(steps)

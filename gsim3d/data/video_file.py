@@ -166,8 +166,7 @@ def _start(times: np.ndarray, marks: np.ndarray, rate: float) -> float:
 def _even_part(times: np.ndarray, header: float) -> tuple[int, float | None]:
     """Returns the number of isolated frames at the end, and the rate of the others.
 
-    Cutting a video without re-encoding can leave such frames: B-frames stored after them, but displayed before, are
-    lost.
+    Cutting without re-encoding can leave such frames: B-frames stored after them, but displayed before, are lost.
     """
     for cut in range(MAX_APART + 1 if len(times) > MIN_EVEN else 1):
         rate = _even_rate(times[: len(times) - cut], header)

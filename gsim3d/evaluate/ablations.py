@@ -355,13 +355,10 @@ def scored(runs: Sequence[dict]) -> list[dict]:
 
 
 def paired_difference(runs: Sequence[dict], first: Sequence[dict], metric: str) -> dict:
-    """Compares the runs of two rows, paired by seed and scene.
+    """Returns ``difference``, ``standard_error`` and ``tie`` of the runs of two rows, paired by seed and scene.
 
-    Scores of one seed share weights, and scores of one scene share data, so pairs are not independent. The standard
-    error is the larger of those over seed means and over scene means.
-
-    Returns:
-        ``difference``, ``standard_error`` and ``tie``; the last two are None for a single pair. {} without pairs.
+    Scores of one seed share weights, and scores of one scene share data, so pairs are not independent: the standard
+    error is the larger of those over seed means and over scene means. It is None for a single pair; {} without pairs.
     """
     ours, theirs = ({r["seed"]: r["by_scene"][metric] for r in scored(part)} for part in (runs, first))
     pairs = [[a - b for a, b in zip(ours[seed], theirs[seed], strict=True)] for seed in ours if seed in theirs]

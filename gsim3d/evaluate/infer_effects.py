@@ -98,14 +98,11 @@ def propose(
     """Chooses for each effect the smallest setting that is as good and as fast as ``base``, then combines them.
 
     While the combination loses more than ``tolerance`` dB or is slower than ``base``, the effect with the largest loss
-    or the smallest speed-up is restored.
+    or the smallest speed-up is restored. Returns a table of all settings, the chosen spec, and its measurement.
 
     Args:
         trial: measures a spec.
         before: measurement of ``base``.
-
-    Returns:
-        Table of all settings, the chosen spec, and its measurement.
     """
     psnr, seconds = before
     table, chosen, lost, saved, put_back = [], {}, {}, {}, {}

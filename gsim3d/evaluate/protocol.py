@@ -230,9 +230,7 @@ def input_frames(
 
 @torch.no_grad()
 def render_steps(restored: Restored, particles: Particles, scene: Scene, cams: Sequence[int], start: int = 0) -> Tensor:
-    """Renders every cloud of one scene's particles from cameras ``cams``.
-
-    The first cloud is rendered with the cameras of step ``start`` (relevant for moving cameras).
+    """Renders every cloud of one scene's particles from ``cams``; moving cameras start at step ``start``.
 
     Returns:
         Images [S, V, H, W, 3], clamped to [0, 1].
@@ -357,9 +355,6 @@ def score_scenes(
         processes: processes that share the scenes. All must call this function, and all return the same scores, equal
             in bits to those of a single process.
         quiet: hide the progress bar.
-
-    Returns:
-        Scores in the order of ``scenes``.
     """
     processes = processes or Processes()
     groups = [[number] for number in range(len(scenes))]

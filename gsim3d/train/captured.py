@@ -210,8 +210,8 @@ class CapturedLoss:
             step = None  # frees its memory before the new capture
             while len(self._steps) >= MOST_KINDS:
                 del self._steps[next(iter(self._steps))]
-            capacity = (_rounded_up(PARTICLES_FACTOR * most) for most in (self.most_particles, self.most_moving))
-            step = _Step(self, *capacity, prepared, weights)
+            units = (PARTICLES_FACTOR * most / PARTICLES_UNIT for most in (self.most_particles, self.most_moving))
+            step = _Step(self, *(PARTICLES_UNIT * math.ceil(n) for n in units), prepared, weights)
         self._steps[kind] = step  # most recently used
         return step(prepared, weights, report)
 
@@ -437,7 +437,3 @@ def _without_background(state: Particles) -> Particles:
 
 def _own(frames: Frames) -> Frames:
     return dataclasses.replace(frames.map(torch.clone), cameras=frames.cameras.map(torch.clone))
-
-
-def _rounded_up(count: float) -> int:
-    return math.ceil(count / PARTICLES_UNIT) * PARTICLES_UNIT

@@ -111,7 +111,8 @@ class DataConfig:
                 raise InputError(
                     f"data.{least}: must be at most data.{most}, {getattr(self, most)}; got {getattr(self, least)}"
                 )
-        if self.resize and (len(self.resize) != 2 or not all(map(_is_side, self.resize))):
+        sides = [side for side in self.resize if 1 <= side <= LARGEST_SIDE and side % SIZE_MULTIPLE == 0]
+        if self.resize and not len(sides) == len(self.resize) == 2:
             wanted = f"must be [width, height], multiples of {SIZE_MULTIPLE} up to {LARGEST_SIDE}"
             raise InputError(f"data.resize: {wanted}; got {list(self.resize)}")
         if self.near_far and (len(self.near_far) != 2 or not 0 < self.near_far[0] < self.near_far[1]):
@@ -272,10 +273,6 @@ class TrainConfig:
                 return phase, step
             step -= phase.steps
         raise IndexError("step lies after the last phase")
-
-
-def _is_side(pixels: int) -> bool:
-    return 1 <= pixels <= LARGEST_SIDE and pixels % SIZE_MULTIPLE == 0
 
 
 # Settings that may change when a run is resumed, without changing the results up to rounding.

@@ -23,9 +23,6 @@ def training_loss(
         images: [I, H, W, 3], rendered images of the target cameras.
         targets: ground truth; image i shows step ``image_cloud[i] % S``.
         weights: [S], from :func:`time_weights`.
-
-    Returns:
-        Scalar loss and errors [S].
     """
     n_steps, truth, shown = weights.shape[0], targets.images.permute(0, 2, 3, 1), targets.dynamic
     weight = 1 + settings.body_weight * shown if settings.body_weight and shown is not None else None

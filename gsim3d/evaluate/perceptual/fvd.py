@@ -53,8 +53,7 @@ def clip_features(clips: Tensor) -> Tensor:
 def fvd(a: Tensor, b: Tensor) -> float:
     """Computes the FVD between two sets of clips, [K, T, H, W, 3] each (K at least 2, T at least 10), in [0, 1].
 
-    Symmetric; 0 for equal sets. With fewer than 256 clips it is biased upwards and noisy: compare only equal numbers of
-    clips.
+    Symmetric; 0 for equal sets. Biased upwards and noisy below 256 clips: compare only equal numbers of clips.
     """
     return frechet_distance(clip_features(a), clip_features(b))
 
