@@ -176,12 +176,12 @@ class EffectsSpec:
 
     @classmethod
     def load(cls, path: str | Path) -> EffectsSpec:
-        """Reads a spec from a YAML or JSON file."""
+        """Reads a spec from the YAML or JSON file ``path``."""
         return cls.from_dict(read_yaml(path, dict | None))
 
     @classmethod
     def of_scene(cls, folder: str | Path) -> EffectsSpec | None:
-        """Reads effects.yaml in the folder of a scene, or up to two folders above; None if there is none."""
+        """Reads effects.yaml in the scene folder ``folder``, or up to two folders above; None if there is none."""
         folder = Path(folder).absolute()
         for around in (folder, folder.parent, folder.parent.parent):
             if (around / FILE).is_file():

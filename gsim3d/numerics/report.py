@@ -166,7 +166,7 @@ class StabilityReport:
         self.is_closed = True
 
     def add(self, finding: Finding) -> None:
-        """Adds a finding; findings of the same kind and location are merged."""
+        """Adds ``finding``; findings of the same kind and location are merged."""
         key = dataclasses.replace(finding, count=0, row=None)
         with self._lock:
             self._total += finding.count
