@@ -413,11 +413,10 @@ class CapturedRollout:
         steps = []
         for step in self._predicted.steps:
             table, device = step.clouds, self._device
-            counts = [table.count(q) for q in range(len(table))]
             numbers = [number + later[scene] for scene, number in zip(table.scenes, table.steps)]
             fields = step.row_fields() | {"origin": step.origin}
             fields = (_clones(fields) if self._copies else fields) | {"world_offset": self._world_offset}
-            steps.append(step.with_clouds(CloudTable.make(counts, table.scenes, numbers, device), **fields))
+            steps.append(step.with_clouds(CloudTable.make(table.counts, table.scenes, numbers, device), **fields))
         renderings = self._predicted.renderings
         if self._copies:
             renderings = [Rendering(*(x if x is None else x.clone() for x in image)) for image in renderings]

@@ -95,6 +95,15 @@ class CloudTable:
         """Returns the number of particles of a cloud."""
         return self.starts[cloud + 1] - self.starts[cloud]
 
+    @property
+    def counts(self) -> list[int]:
+        """Number of particles of each cloud."""
+        return [self.count(cloud) for cloud in range(len(self))]
+
+    def ahead(self, n_steps: int) -> CloudTable:
+        """The same clouds ``n_steps`` later."""
+        return self.make(self.counts, self.scenes, (step + n_steps for step in self.steps), self.tensors[0].device)
+
     def row_runs(self, clouds: Sequence[int]) -> list[tuple[int, int]]:
         """Returns the row ranges [begin, end) of ``clouds``; consecutive clouds are merged into one range."""
         runs, before = [], None
@@ -308,9 +317,17 @@ class Particles(TensorRecord):
             torch.arange(self.n_clouds, device=counts.device), counts, output_size=self.n_rows
         )
 
+    def row_scene(self) -> Tensor:
+        """Returns the scene of each particle, int64 [N]."""
+        return self.cloud_scene[self.row_cloud()]
+
+    def row_origin(self) -> Tensor:
+        """Returns the origin of each particle's scene, float64 [N, 3]."""
+        return self.origin[self.row_scene()]
+
     def row_offset(self) -> Tensor | None:
         """Returns the ``world_offset`` of each particle's scene, float64 [N, 3]; None if there is none."""
-        return None if self.world_offset is None else self.world_offset[self.cloud_scene[self.row_cloud()]]
+        return None if self.world_offset is None else self.world_offset[self.row_scene()]
 
     def select_rows(self, rows: Tensor) -> Particles:
         """Keeps the particles selected by ``rows`` (bool [N]); clouds remain even if they become empty."""

@@ -210,7 +210,7 @@ class Dynamics(nn.Module):
         if not ctx.is_empty:
             for prior in self.priors:
                 steps = [prior.finish(step, gains.get(prior.name), ctx) for step in steps]
-        steps = [_later(step, 1 + i) for i, step in enumerate(steps)]
+        steps = [step.with_clouds(step.clouds.ahead(1 + i)) for i, step in enumerate(steps)]
         return steps[0] if len(steps) == 1 else concatenate(steps)
 
     def _move(self, ctx: StepContext, network: Tensor, gains: Mapping[str, Tensor]) -> Tensor:
@@ -330,14 +330,6 @@ class Dynamics(nn.Module):
             tuple(torch.randperm(4, generator=generator, device=generator.device).tolist())
             for _ in range(self.config.n_stages)
         )
-
-
-def _later(particles: Particles, n_steps: int) -> Particles:
-    """Moves the step numbers of ``particles`` ahead by ``n_steps``."""
-    table = particles.clouds
-    counts = [table.count(q) for q in range(len(table))]
-    later = CloudTable.make(counts, table.scenes, (step + n_steps for step in table.steps), particles.cu_rows.device)
-    return particles.with_clouds(later)
 
 
 def _seen_first(seen: Tensor, cu_rows: Tensor, n_rows: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsim3d.state import ASLEEP, FROZEN, CloudTable, Particles, last_steps, newest_clouds
+from gsim3d.state import ASLEEP, FROZEN, Particles, last_steps, newest_clouds
 
 
 @dataclass(frozen=True)
@@ -58,9 +58,7 @@ class Partition:
 
     def whole(self, step: Particles | None, ahead: int) -> Particles:
         """All particles ``ahead`` steps after the newest, with the moving ones from ``step`` (None: nothing moved)."""
-        table = self.newest.clouds
-        counts = [table.count(q) for q in range(len(table))]
-        later = CloudTable.make(counts, table.scenes, (s + ahead for s in table.steps), self.newest.cu_rows.device)
+        later = self.newest.clouds.ahead(ahead)
         if step is None:
             return self.newest.with_clouds(later)
         if self.rows.shape[0] == self.newest.n_rows:

@@ -102,7 +102,7 @@ class Sleepers:
 
     def _may_sleep(self, before: Particles, after: Particles) -> Tensor:
         restless = self.last_change > self.n_steps - self.patience
-        scene = after.cloud_scene[after.row_cloud()]
+        scene = after.row_scene()
         if self.rule.policy == "exact":
             n_restless = torch.zeros(after.origin.shape[0], dtype=torch.int64, device=scene.device)
             return n_restless.index_add_(0, scene, restless.long())[scene] == 0

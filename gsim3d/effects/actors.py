@@ -99,7 +99,7 @@ class Actors:
         """Displacement [N, 3] of each particle's actor, ``later`` steps after the newest; arbitrary for others."""
         table = particles.clouds
         step = max(0, table.steps[-1] - self._first[table.scenes[-1]] + later)
-        scene = self._scene_index[particles.cloud_scene[particles.row_cloud()]]
+        scene = self._scene_index[particles.row_scene()]
         return self._displacements[particles.actor.clamp_min(0), scene, step]
 
     def _shifted(self, history: Particles) -> Particles:

@@ -371,7 +371,7 @@ def _between(there: Tensor | None, here: Tensor | None, by: Vector) -> Vector | 
 
 def _centers(state: Particles, chosen: Tensor) -> Tensor:
     """Mean position [N, 3] of the ``chosen`` particles in the newest cloud of each particle's scene."""
-    scene = state.cloud_scene[state.row_cloud()]
+    scene = state.row_scene()
     chosen = chosen & newest_mask(state)
     one = F.one_hot(scene, int(scene.max()) + 1).to(state.means)
     sums = (one * chosen[:, None]).mT @ torch.cat([state.means, torch.ones_like(state.means[:, :1])], 1)
@@ -385,6 +385,6 @@ def _joined(state: Particles, more: Particles) -> Particles:
     order = torch.argsort(clouds, stable=True)
     fields = {name: torch.cat([value, getattr(parts[1], name)])[order] for name, value in parts[0].row_fields().items()}
     tables = [part.clouds for part in parts]
-    counts = [sum(table.count(q) for table in tables) for q in range(len(tables[0]))]
+    counts = map(sum, zip(*(table.counts for table in tables)))
     table = CloudTable.make(counts, tables[0].scenes, tables[0].steps, state.cu_rows.device)
     return state.with_clouds(table, **fields)

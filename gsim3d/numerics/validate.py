@@ -305,7 +305,7 @@ def _neutral(name: str, particles: Particles) -> Tensor:
     """Replacements of invalid values of an attribute without previous values."""
     value = getattr(particles, name)
     if name == "means":
-        return particles.origin[particles.cloud_scene[particles.row_cloud()]].to(value)
+        return particles.row_origin().to(value)
     neutral = torch.zeros_like(value)
     if name == "quats":
         neutral[:, 0] = 1
@@ -336,7 +336,7 @@ def _clamped_means(
         share = (max_speed / length.clamp(min=max_speed)).to(step)
         means = torch.where(status[:, None] & FAST != 0, previous.means + share * step, means)
     if grid_size > 0:
-        origin = particles.origin[particles.cloud_scene[particles.row_cloud()]]
+        origin = particles.row_origin()
         inside = (means.double() - origin).clamp(0, (CELLS - 0.5) * grid_size)
         outside = status[:, None] & (OUTSIDE | FAST | 1) != 0
         means = torch.where(outside, (origin + inside).to(means), means)

@@ -31,8 +31,7 @@ class PaddedClouds:
     def __init__(self, history: Particles, chosen: list[int], grid_size: float):
         table, device = history.clouds, history.means.device
         starts, counts, scenes = (
-            constant(tuple(of[q] for q in chosen), device)
-            for of in (table.starts, [table.count(q) for q in range(len(table))], table.scenes)
+            constant(tuple(of[q] for q in chosen), device) for of in (table.starts, table.counts, table.scenes)
         )
         index = torch.arange(max(1, max(table.count(q) for q in chosen)), device=device)
         self.rows = (starts[:, None] + index).clamp(max=history.n_rows - 1)

@@ -50,4 +50,4 @@ def position_waves(particles: Particles, count: int, longest: float) -> Tensor:
 
 def relative_positions(particles: Particles) -> Tensor:
     """Positions relative to the origins of the scenes in metres, float64 [N, 3]."""
-    return particles.means.double() - particles.origin[particles.cloud_scene[particles.row_cloud()]]
+    return particles.means.double() - particles.row_origin()

@@ -183,8 +183,7 @@ def random_order(particles: Particles) -> Tensor:
     """Random permutation of the particles of each cloud, int64 [N]; the same one for clouds of equal sizes, so that the
     particles of simulated steps still correspond."""
     table = particles.clouds
-    counts = [table.count(q) for q in range(len(table))]
-    order = [torch.randperm(n, generator=torch.Generator().manual_seed(0)) for n in counts]
+    order = [torch.randperm(n, generator=torch.Generator().manual_seed(0)) for n in table.counts]
     order = torch.cat([start + within for start, within in zip(table.starts[:-1], order, strict=True)])
     return order.to(particles.means.device)
 

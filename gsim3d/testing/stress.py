@@ -217,13 +217,14 @@ def _refuses(what: str, call: Callable, names: str) -> Deviation:
 def crowds(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
     """One particle, all particles at one position, and every particle twice: rollouts and images are finite."""
     state = simulator.encode(sample.frames).detach()
-    counts = [state.clouds.count(q) for q in range(state.n_clouds)]
     first = state.cu_rows[state.row_cloud()]  # first particle of each particle's cloud
     number = torch.arange(state.n_rows, device=first.device)
     crowds = {
         "one particle": state.select_rows(number == first),
         "all at one position": dataclasses.replace(state, means=state.means[first]),
-        "every particle twice": repack(state, number.repeat_interleave(2), [2 * count for count in counts]),
+        "every particle twice": repack(
+            state, number.repeat_interleave(2), [2 * count for count in state.clouds.counts]
+        ),
     }
     for name, crowd in crowds.items():
         steps = simulator.rollout(crowd, sample.n_steps, sample.plan, report=StabilityReport())

@@ -189,7 +189,7 @@ def unfreeze(particles: Particles, most: float, spec: EffectsSpec, rng: np.rando
         rng: random generator; one draw per scene and per cube.
     """
     edge = (spec.dynamics.sleep or Sleep()).halo
-    scene = particles.cloud_scene[particles.row_cloud()]
+    scene = particles.row_scene()
     cube = torch.floor((particles.means.detach().double() - particles.origin[scene]) / edge).nan_to_num().long()
     _, index = torch.unique(torch.cat([scene[:, None], cube], 1), dim=0, return_inverse=True)
     shares = torch.as_tensor(most * rng.random(particles.origin.shape[0]), device=scene.device)
