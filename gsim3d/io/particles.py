@@ -40,6 +40,8 @@ def read_particles(path: str | Path) -> tuple[Particles, str]:
         InputError: it is no such file, is damaged, or holds several scenes.
     """
     path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
     try:
         with safetensors.safe_open(path, "pt") as file:
             about = json.loads((file.metadata() or {})[ABOUT])

@@ -38,13 +38,13 @@ from gsim3d.errors import InputError, NumericalError
 from gsim3d.evaluate.perceptual import weights
 from gsim3d.evaluate.plan_report import TIMES, load_times
 from gsim3d.evaluate.predictions import Predictions
-from gsim3d.io import checkpoint, read_ply, read_splats, write_ply, write_splats
+from gsim3d.io import checkpoint, read_particles, read_ply, read_splats, write_particles, write_ply, write_splats
 from gsim3d.io.files import read_yaml
 from gsim3d.io.sequence import open_sequence, write_about
 from gsim3d.io.settings import from_dict, to_dict
 from gsim3d.numerics.speed import load_speed
 from gsim3d.simulator import Simulator
-from gsim3d.state import Gaussians
+from gsim3d.state import Gaussians, Particles
 from gsim3d.synth.meshes import load_body
 from gsim3d.testing import stability
 from gsim3d.train.config import DataConfig, TrainConfig
@@ -235,6 +235,22 @@ def _write_spz_4(folder: Path) -> None:
     (folder / "a.spz").write_bytes(spz_4(gzip.decompress((folder / "a.spz").read_bytes())))
 
 
+def _write_state(folder: Path) -> None:
+    rows = {"means": torch.rand(4, 3), "opacities": torch.rand(4), "activity": torch.tensor([0, 1, 0, 1]).byte()}
+    latents = {"dynamic_latents": torch.rand(4, 2), "static_latents": torch.rand(4, 3)}
+    clouds = {
+        "cu_rows": torch.tensor([0, 2, 4]),
+        "cloud_scene": torch.tensor([0, 0]),
+        "cloud_step": torch.tensor([3, 4]),
+    }
+    particles = Particles(**rows, **latents, **clouds, origin=torch.zeros(1, 3, dtype=torch.float64))
+    write_particles(folder / "a.safetensors", particles)
+
+
+def _read_state(folder: Path, what: str) -> None:
+    finite(read_particles(folder / "a.safetensors")[0])
+
+
 def _write_sequence(folder: Path) -> None:
     for step in range(2):
         write_splats(folder / f"step_{step}.splat", _gaussians())
@@ -406,6 +422,7 @@ READERS = {
     },
     "spz_unpacked": Reader(_write_unpacked_spz, _read_unpacked_spz),
     **({"spz_4": Reader(_write_spz_4, partial(_read_splats, ".spz"))} if importlib.util.find_spec("zstandard") else {}),
+    "state": Reader(_write_state, _read_state),
     "sequence": Reader(_write_sequence, _read_sequence, ("sequence.json",), headless=True),
     "ply_lists": Reader(lambda folder: _write_list_ply(folder / "a.ply", "binary_big_endian"), _read_ply),
     "ply_lists_text": Reader(lambda folder: _write_list_ply(folder / "a.ply", "ascii"), _read_ply),
