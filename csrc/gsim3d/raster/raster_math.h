@@ -442,26 +442,32 @@ GSIM3D_HD void footprint_vjp(const Footprint<V>& shape, const Moments<V>& sums, 
   grad.yy = half * (b * b * sums.yy + c * c * sums.uu) - b * c * sums.uy;
 }
 
-// ---- a Gaussian that is projected already: its conic (a, b, c) is Sigma^-1 ------------------------------------------
+// ---- a Gaussian that is projected already: its conic (a, b, c) is Sigma^-1; T is a scalar ---------------------------
 
-template <typename V>
-GSIM3D_HD bool conic_is_good(V a, V b, V c) {
-  return usable(a) && usable(b) && usable(c) && a > V{} && a * c - b * b > V{};
+// Of needles the difference cancels: its products are exact in double.
+template <typename T>
+GSIM3D_HD T conic_determinant(T a, T b, T c) {
+  return static_cast<T>(static_cast<double>(a) * c - static_cast<double>(b) * b);
 }
 
-template <typename V>
-GSIM3D_HD Footprint<V> footprint_of_conic(V a, V b, V c) {
-  return {-b / a, a, (a * c - b * b) / a};
+template <typename T>
+GSIM3D_HD bool conic_is_good(T a, T b, T c) {
+  return usable(a) && usable(b) && usable(c) && a > T(0) && conic_determinant(a, b, c) > T(0);
 }
 
-template <typename V>
+template <typename T>
+GSIM3D_HD Footprint<T> footprint_of_conic(T a, T b, T c) {
+  return {-b / a, a, conic_determinant(a, b, c) / a};
+}
+
+template <typename T>
 struct Covariance {
-  V xx, yy, determinant;
+  T xx, yy, determinant;
 };
 
-template <typename V>
-GSIM3D_HD Covariance<V> covariance_of_conic(V a, V b, V c) {
-  const V inverse = Lanes<V>::splat(1) / (a * c - b * b);
+template <typename T>
+GSIM3D_HD Covariance<T> covariance_of_conic(T a, T b, T c) {
+  const T inverse = T(1) / conic_determinant(a, b, c);
   return {c * inverse, a * inverse, inverse};
 }
 
