@@ -45,8 +45,14 @@ def draw(means, quats, scales, opacities, colors, viewmats):
     return ops.rasterize_gaussians(means, quats, scales, opacities, one, colors=colors).color
 
 
+def project(means, quats, scales, viewmats):
+    pairs = ops.project_gaussians(means, quats, scales, dataclasses.replace(cameras(), viewmats=viewmats))
+    return torch.cat([pairs.means2d, pairs.conics], 1)
+
+
 STAGE = pyramid().stages[0]
 MEANS = values(6, 3) + torch.tensor([-0.5, -0.5, 2.0])
+CONICS = values(6, 3) + torch.tensor([1.0, 0.0, 1.0])
 # op -> (function of tensors, all of which have gradients; those tensors)
 CALLS = {
     "pool_max": (lambda x: ops.pool_max(x, ROWS, CU), [values(6, 3)]),
@@ -77,6 +83,12 @@ CALLS = {
     "add_cells": (lambda x, field: ops.add_cells(x, field, ROWS % 2), [values(6, 3), values(2, 3)]),
     "plane_sweep": (sweep, [values(2, 4, 3, 3)]),
     "rasterize_gaussians": (draw, [MEANS, values(6, 4), values(6, 3), values(6), values(6, 3), torch.eye(4)[None]]),
+    "project_gaussians": (project, [MEANS, values(6, 4), values(6, 3), torch.eye(4)[None]]),
+    "sh_to_color": (ops.sh_to_color, [MEANS, values(6, 4, 3)]),
+    "rasterize_projected": (
+        lambda *x: ops.rasterize_projected(*x, width=8, height=8).color,
+        [8 * values(6, 2), CONICS, MEANS[:, 2], values(6), values(6, 3)],
+    ),
 }
 
 
