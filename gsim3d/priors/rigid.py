@@ -66,7 +66,7 @@ def solve3(matrices: Tensor, values: Tensor) -> Tensor:
 
 
 def best_rotation(products: Tensor) -> Tensor:
-    """Rotations R [..., 3, 3] that minimise sum |b - R a|^2, from ``products`` = sum b a^T [..., 3, 3].
+    """Rotations R [..., 3, 3] that minimise ``sum |b - R a|^2``, from ``products`` = sum b a^T [..., 3, 3].
 
     If the minimum is not unique, as for points on a line, the result is the mean of the minima and no rotation. For
     zero products it is 0.

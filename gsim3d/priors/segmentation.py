@@ -81,28 +81,28 @@ def segment_bodies(movable: Movable, particles: Particles, config: SegmentationC
 
 def _clusters(positions: Tensor, known: Tensor, config: SegmentationConfig) -> Tensor:
     """Index of the body of each sample, int64 [B, S]."""
-    far = torch.where(known[:, :, None] & known[:, None], squared_distances(positions, positions), torch.inf)
-    reach = far.topk(config.neighbors, dim=2, largest=False).values[:, :, -1]
-    half = (known.sum(1, keepdim=True) - 1).clamp(min=0) // 2
-    near = (far <= reach.sort(1).values.gather(1, half)[:, :, None]) & known[:, None]
+    distances = torch.where(known[:, :, None] & known[:, None], squared_distances(positions, positions), torch.inf)
+    core_distances = distances.topk(config.neighbors, dim=2, largest=False).values[:, :, -1]
+    median = (known.sum(1, keepdim=True) - 1).clamp(min=0) // 2
+    near = (distances <= core_distances.sort(1).values.gather(1, median)[:, :, None]) & known[:, None]
     dense = (near.sum(2) >= config.neighbors) & known
     cluster = _connected(near & dense[:, :, None] & dense[:, None])
     size = ((cluster[:, :, None] == cluster[:, None]) & dense[:, None]).sum(2)
     is_large = dense & (size >= config.min_share * torch.where(dense, size, 0).amax(1, keepdim=True))
-    cluster = cluster.gather(1, _nearest(far, is_large))
+    cluster = cluster.gather(1, _nearest(distances, is_large))
 
     members = (cluster[:, :, None] == torch.arange(SAMPLES, device=cluster.device)) & known[:, :, None]
     members = members.to(positions.dtype)  # [B, samples, clusters]
-    meets = (near.to(positions.dtype) @ members > 0).to(positions.dtype)
-    wide = members.mT @ meets > config.neck * members.sum(1)[:, :, None]  # [B, clusters, clusters]
-    by_sample = wide.gather(1, cluster[:, :, None].expand_as(wide))
-    linked = by_sample.gather(2, cluster[:, None].expand_as(wide))
+    touches = (near.to(positions.dtype) @ members > 0).to(positions.dtype)
+    merged = members.mT @ touches > config.neck * members.sum(1)[:, :, None]  # [B, clusters, clusters]
+    by_sample = merged.gather(1, cluster[:, :, None].expand_as(merged))
+    linked = by_sample.gather(2, cluster[:, None].expand_as(merged))
     return _connected(linked | linked.mT)
 
 
-def _nearest(far: Tensor, wanted: Tensor) -> Tensor:
-    """Index of the nearest sample in the mask ``wanted`` [B, S], from squared distances [B, M, S]: int64 [B, M]."""
-    return torch.where(wanted[:, None], far, torch.inf).argmin(2)
+def _nearest(distances: Tensor, mask: Tensor) -> Tensor:
+    """Index of the nearest sample in ``mask`` [B, S], from squared distances [B, M, S]: int64 [B, M]."""
+    return torch.where(mask[:, None], distances, torch.inf).argmin(2)
 
 
 def _connected(near: Tensor) -> Tensor:

@@ -64,14 +64,15 @@ def shape_residual(windows: Windows, history: Particles, state: Particles) -> Te
     """Vector [N, 3] in metres from each movable particle to its goal position; 0 for other particles."""
     movable, rest = windows.movable, state.rest_positions
     with torch.autocast(rest.device.type, enabled=False):
-        before = (movable.gather(rest).double() - history.origin[movable.scenes][:, None]).to(rest.dtype)
-        then, now = movable.samples.take(before), movable.samples
-        there = now.mean_of(then)[:, None]
-        then, before = torch.where(now.known[:, :, None], then - there, 0), before - there
-        center, began = windows.weights @ now.positions, windows.weights @ then
-        products = windows.weights @ (now.positions[:, :, :, None] * then[:, :, None]).flatten(2)
-        turns = best_rotation(products.unflatten(2, (3, 3)) - center[:, :, :, None] * began[:, :, None])
-        shifts = center - (turns @ began[:, :, :, None])[..., 0]
-        *columns, shift = windows.to_particles(*turns.unbind(3), shifts)
-        residual = (torch.stack(columns, 3) @ before[:, :, :, None])[..., 0] + shift - movable.positions
+        rest_positions = (movable.gather(rest).double() - history.origin[movable.scenes][:, None]).to(rest.dtype)
+        rest_samples, samples = movable.samples.take(rest_positions), movable.samples
+        rest_mean = samples.mean_of(rest_samples)[:, None]
+        rest_samples = torch.where(samples.known[:, :, None], rest_samples - rest_mean, 0)
+        rest_positions = rest_positions - rest_mean
+        center, rest_center = windows.weights @ samples.positions, windows.weights @ rest_samples
+        products = windows.weights @ (samples.positions[:, :, :, None] * rest_samples[:, :, None]).flatten(2)
+        rotations = best_rotation(products.unflatten(2, (3, 3)) - center[:, :, :, None] * rest_center[:, :, None])
+        shifts = center - (rotations @ rest_center[:, :, :, None])[..., 0]
+        *columns, shift = windows.to_particles(*rotations.unbind(3), shifts)
+        residual = (torch.stack(columns, 3) @ rest_positions[:, :, :, None])[..., 0] + shift - movable.positions
         return movable.scatter(residual)

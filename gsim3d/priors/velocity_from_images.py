@@ -86,8 +86,8 @@ def estimate_velocity(
     """
     particles, clouds, newest = ctx.history, ctx.history.clouds, ctx.newest
     result = torch.zeros_like(particles.means)
-    first = [_oldest(clouds, begin, q, ctx.max_steps) for begin, q in zip([0, *(q + 1 for q in newest)], newest)]
-    if first == newest or ctx.is_empty:
+    oldest = [_oldest(clouds, start, q, ctx.max_steps) for start, q in zip([0, *(q + 1 for q in newest)], newest)]
+    if oldest == newest or ctx.is_empty:
         return result
     with torch.autocast(particles.means.device.type, enabled=False):
         movable = ctx.movable
@@ -96,22 +96,22 @@ def estimate_velocity(
         seen = _Views(frames, particles, *images, newest, movable.center, config)
         center = windows.weights @ now.positions
         spin = torch.zeros_like(center)  # rad/step
-        for earlier in ([max(f, q - 1) for f, q in zip(first, newest)], first):
+        for earlier in ([max(f, q - 1) for f, q in zip(oldest, newest)], oldest):
             then = Samples(Subset(PaddedClouds(particles, earlier, ctx.grid_size), particles))
             then.center(movable.center)
             before = _Views(frames, particles, *images, earlier, movable.center, config)
             spans = constant(tuple(clouds.steps[q] - clouds.steps[e] for e, q in zip(earlier, newest)), spin.device)
-            begin = _shift(now, then, windows.nodes, config.radius), spans[:, None, None] * spin
-            a_step = _per_step(clouds, earlier, newest, now, then)
-            velocity, spin = (x * a_step for x in _align(windows, center, *begin, seen, before, config))
-        velocity, spin, middle = windows.to_particles(velocity, spin, center)
-        found = -next_displacement(movable.positions, -velocity, -spin, middle)
+            start = _shift(now, then, windows.nodes, config.radius), spans[:, None, None] * spin
+            per_step = _per_step(clouds, earlier, newest, now, then)
+            velocity, spin = (x * per_step for x in _align(windows, center, *start, seen, before, config))
+        velocity, spin, pivot = windows.to_particles(velocity, spin, center)
+        displacement = -next_displacement(movable.positions, -velocity, -spin, pivot)
         if fall is not None:
-            spans = [clouds.steps[q] - clouds.steps[f] for f, q in zip(first, newest)]
-            later = constant(tuple(max(0, span - 1) for span in spans), found.device)
-            found = found + 0.5 * later[:, None, None] * movable.gather(fall)
-        found = movable.scatter(found)
-    for q, part in zip(newest, found.split([clouds.count(q) for q in newest]), strict=True):
+            spans = [clouds.steps[q] - clouds.steps[f] for f, q in zip(oldest, newest)]
+            remaining = constant(tuple(max(0, span - 1) for span in spans), displacement.device)
+            displacement = displacement + 0.5 * remaining[:, None, None] * movable.gather(fall)
+        displacement = movable.scatter(displacement)
+    for q, part in zip(newest, displacement.split([clouds.count(q) for q in newest]), strict=True):
         result[clouds.starts[q] : clouds.starts[q + 1]] = part
     return result
 
@@ -134,23 +134,23 @@ def _align(
     now, window = windows.movable.samples, windows.weights
     outwards = F.normalize(now.positions - windows.to_samples(center)[0], dim=2)
     positions = now.positions + config.inside * outwards
-    wanted = []
+    targets = []
     for view in range(seen.n_views):
-        colours, is_shown = seen.colours(view, positions)
-        wanted.append((colours, now.known & is_shown & seen.faces(view, positions, outwards)))
+        colours, is_visible = seen.colours(view, positions)
+        targets.append((colours, now.known & is_visible & seen.faces(view, positions, outwards)))
     for _ in range(PASSES):
-        gone, turned, middle = windows.to_samples(velocity, spin, center)
-        back = positions + next_displacement(positions, -gone, -turned, middle)
-        squared, missed = back.new_zeros(*back.shape[:2], 6, 6), back.new_zeros(*back.shape[:2], 6)
-        for view, (colours, is_shown) in enumerate(wanted):
-            found, was_shown, slopes = before.slopes(view, back)
-            off, counts = colours - found, is_shown & was_shown & before.faces(view, back, outwards)
-            counts = counts * (config.robust / off.norm(dim=2).clamp(min=config.robust))
-            by_spin = torch.linalg.cross(slopes, (back + gone - middle)[:, :, None].expand_as(slopes))
-            by_motion = torch.cat([by_spin, -slopes], 3)
-            squared = squared + counts[..., None, None] * (by_motion.mT @ by_motion)
-            missed = missed + counts[..., None] * (by_motion * off[..., None]).sum(2)
-        change = _solve6((window @ squared.flatten(2)).unflatten(2, (6, 6)), window @ missed)
+        shift, rotation, pivot = windows.to_samples(velocity, spin, center)
+        earlier = positions + next_displacement(positions, -shift, -rotation, pivot)
+        hessian, gradient = earlier.new_zeros(*earlier.shape[:2], 6, 6), earlier.new_zeros(*earlier.shape[:2], 6)
+        for view, (colours, is_visible) in enumerate(targets):
+            matched, was_visible, jacobian = before.slopes(view, earlier)
+            residual, confidence = colours - matched, is_visible & was_visible & before.faces(view, earlier, outwards)
+            confidence = confidence * (config.robust / residual.norm(dim=2).clamp(min=config.robust))
+            by_spin = torch.linalg.cross(jacobian, (earlier + shift - pivot)[:, :, None].expand_as(jacobian))
+            by_motion = torch.cat([by_spin, -jacobian], 3)
+            hessian = hessian + confidence[..., None, None] * (by_motion.mT @ by_motion)
+            gradient = gradient + confidence[..., None] * (by_motion * residual[..., None]).sum(2)
+        change = _solve6((window @ hessian.flatten(2)).unflatten(2, (6, 6)), window @ gradient)
         spin, velocity = spin + change[..., :3], velocity + change[..., 3:]
     return velocity, spin
 
@@ -160,14 +160,14 @@ def _solve6(matrices: Tensor, values: Tensor) -> Tensor:
 
     CUDA graphs can capture it.
     """
-    size = matrices.diagonal(dim1=2, dim2=3).mean(2)[..., None, None] + LEAST
-    one = torch.eye(3, dtype=matrices.dtype, device=matrices.device)
-    turns, mixed, ways = matrices[..., :3, :3], matrices[..., :3, 3:], matrices[..., 3:, 3:]
-    turns, ways = turns + STIFF * size * one, ways + STILL * size * one
-    by_way = solve3(turns[..., None, :, :], mixed.mT)  # [B, G, 3, 3]
-    by_value = solve3(turns, values[..., :3])
-    way = solve3(ways - by_way @ mixed, values[..., 3:] - (mixed.mT @ by_value[..., None])[..., 0])
-    return torch.cat([by_value - (by_way.mT @ way[..., None])[..., 0], way], 2)
+    scale = matrices.diagonal(dim1=2, dim2=3).mean(2)[..., None, None] + LEAST
+    eye = torch.eye(3, dtype=matrices.dtype, device=matrices.device)
+    spins, mixed, shifts = matrices[..., :3, :3], matrices[..., :3, 3:], matrices[..., 3:, 3:]
+    spins, shifts = spins + STIFF * scale * eye, shifts + STILL * scale * eye
+    by_shift = solve3(spins[..., None, :, :], mixed.mT)  # [B, G, 3, 3]
+    by_value = solve3(spins, values[..., :3])
+    shift = solve3(shifts - by_shift @ mixed, values[..., 3:] - (mixed.mT @ by_value[..., None])[..., 0])
+    return torch.cat([by_value - (by_shift.mT @ shift[..., None])[..., 0], shift], 2)
 
 
 def _images(frames: Frames, n_clouds: int, n_views: int | None) -> tuple[Tensor, Tensor]:
