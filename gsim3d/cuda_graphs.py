@@ -264,7 +264,7 @@ class CapturedRollout:
             for name in ROUNDED_PARTS:
                 getattr(self._model, name).load_state_dict(getattr(self._simulator, name).state_dict())
 
-    # ---- what runs ----
+    # ---- computation ----
 
     def _rollout(self, geometry, report: StabilityReport) -> Prediction:
         """Computes the rollout of the graph's static state."""
@@ -358,7 +358,7 @@ class CapturedRollout:
         found, moving, counted = self._on_host.clone().tensor_split([n := self._found.numel(), n + 1])
         return found.view(self._found.shape).tolist(), int(moving), counted
 
-    # ---- what goes in and comes out ----
+    # ---- inputs and results ----
 
     def _load_parts(self, parts: Partition) -> Particles:
         """Copies the frozen particles into the graph's memory; returns the movable particles."""

@@ -119,7 +119,7 @@ class _CameraFiles:
         return np.where(is_marked(marked), MOVING, np.where(solid, FIXED, BACKGROUND)).astype(np.uint8)
 
     def camera(self, numbers: Sequence[int]) -> Camera:
-        """Poses ``numbers`` of the camera."""
+        """Returns the camera with the poses at frame ``numbers``."""
         return Camera(self.name, self.size, self._viewmats(numbers), self._K())
 
     def _viewmats(self, numbers: Sequence[int]) -> np.ndarray:
@@ -149,7 +149,7 @@ class _CameraFiles:
         return OPENGL @ inverse(poses)
 
     def _K(self) -> np.ndarray:
-        """[3, 3], pixels."""
+        """Returns the intrinsics [3, 3] in pixels."""
         entry, (width, height) = self._entry, self.size
         if entry.values.get("K") is not None:
             normalised = entry.array("K", (3, 3))

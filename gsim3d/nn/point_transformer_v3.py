@@ -114,6 +114,7 @@ class PointTransformerV3(nn.Module):
         x: [N, in_channels].
         pyramid: of the same points.
         generator: of drop path, in training; None: no drop path.
+
     Source:
         Point Transformer V3 (Wu et al. 2024), without a segmentation head.
 

@@ -255,7 +255,7 @@ class _Step:
         most = self._owner.grow(self._clouds, [capacity.sizes for capacity in needed])
         self._capacities = [capacity.grown((0, *most), 1) for capacity in needed]
 
-    # ---- what runs ----
+    # ---- computation ----
 
     def _encode(self, report: StabilityReport) -> Particles:
         owner = self._owner

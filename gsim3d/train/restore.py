@@ -131,7 +131,7 @@ class Restored:
                 f"{scene.path}: images of {scene.width}x{scene.height} pixels; the model was trained on "
                 f"{self.image_size[0]}x{self.image_size[1]} (a model trained with data: {{resize: [W, H]}} fits them)"
             )
-        fitted = scene.fitting.enlarge  # by open_scene, which chose the depths
+        fitted = scene.fitting.enlarge  # set by open_scene, which already fitted the depths
         if self.data.near_far and not fitted and (scene.near, scene.far) != tuple(self.data.near_far):
             raise InputError(
                 f"{scene.path}: depth range {scene.near:g} to {scene.far:g}; the model was trained on "
