@@ -107,9 +107,9 @@ class Point:
         by_step: metric -> score at each step.
         encode: timings of the encoding of the input, one a round.
         step: timings of one simulated step with its images, one a round.
-        once: seconds of the graph capture before the first step.
-        peak: GPU memory in bytes that a step allocates on top of model and input; 0 on a CPU.
-        resting: fraction of sleeping particles.
+        capture_seconds: seconds of the graph capture before the first step.
+        peak_bytes: GPU memory in bytes that a step allocates on top of model and input; 0 on a CPU.
+        resting_share: fraction of sleeping particles.
     """
 
     setting: Setting
@@ -121,9 +121,9 @@ class Point:
     by_step: dict = field(default_factory=dict)
     encode: tuple[Timing, ...] = ()
     step: tuple[Timing, ...] = ()
-    once: float = 0.0
-    peak: int = 0
-    resting: float = 0.0
+    capture_seconds: float = 0.0
+    peak_bytes: int = 0
+    resting_share: float = 0.0
 
     @property
     def step_seconds(self) -> float:
@@ -176,12 +176,12 @@ class Rollout:
     Attributes:
         images: [S, V, H, W, 3] in [0, 1].
         moving: S tensors [n, 3], positions of the moving particles.
-        resting: fraction of sleeping particles.
+        resting_share: fraction of sleeping particles.
     """
 
     images: Tensor
     moving: list[Tensor]
-    resting: float = 0.0
+    resting_share: float = 0.0
 
 
 class BenchmarkCase:
@@ -306,7 +306,7 @@ class BenchmarkCase:
                 differences.append(psnr(found.images.flatten(0, 1), reference.images.flatten(0, 1)).cpu())
                 distances.append(_distances(found, reference, cell))
                 scores.append(truth.score([("", found.images)]))
-                resting.append(found.resting)
+                resting.append(found.resting_share)
         except (torch.OutOfMemoryError, NumericalError, InputError) as error:
             point.failure = reason(error)
             return
@@ -315,7 +315,7 @@ class BenchmarkCase:
             mean, largest = float(positions.mean()), float(positions.max())
         point.agreement = Agreement(float(images.mean()), float(images.min()), mean, largest)
         point.task, point.by_step = _means(scores)
-        point.resting = statistics.fmean(resting)
+        point.resting_share = statistics.fmean(resting)
 
     @property
     def metric(self) -> str:
@@ -370,7 +370,7 @@ class Stepping:
         InputError: the model does not support the setting.
 
     Attributes:
-        once: seconds of the capture.
+        capture_seconds: seconds of the capture.
     """
 
     def __init__(
@@ -385,7 +385,7 @@ class Stepping:
         self.runner = case.runner(setting)
         self.state, self.cameras = case.start(self.runner, numbers), case.cameras(numbers, 0)
         self.span = self.runner.span(case.n_steps) if span is None else span
-        self.once, self._graph, self._stopwatch = 0.0, None, stopwatch
+        self.capture_seconds, self._graph, self._stopwatch = 0.0, None, stopwatch
         if setting.captured:
             clock.wait()
             start = clock.now()
@@ -394,7 +394,7 @@ class Stepping:
                 with stopwatch.capturing() if marked else nullcontext():
                     self._graph = self.runner.captured(self.state, self.span, self.cameras)
             clock.wait()
-            self.once = clock.now() - start
+            self.capture_seconds = clock.now() - start
 
     def __call__(self) -> None:
         if self._stopwatch is None:
@@ -513,9 +513,9 @@ class Sweep:
         before = torch.cuda.memory_allocated(case.device)
         stepping = self._graphs.get(setting) or Stepping(case, setting, self.clock)
         if setting.captured:
-            self._graphs[setting], point.once = stepping, point.once or stepping.once
+            self._graphs[setting], point.capture_seconds = stepping, point.capture_seconds or stepping.capture_seconds
         timing = time_call(stepping, self.clock, effort.repeats, effort.warm_up)
-        point.peak = max(point.peak, torch.cuda.max_memory_allocated(case.device) - before)
+        point.peak_bytes = max(point.peak_bytes, torch.cuda.max_memory_allocated(case.device) - before)
         if not point.step and setting.sleep is None:
             timing = Timing(timing.repeats, self.sections_of_graph(setting, timing))
         return timing.split_over(stepping.span)

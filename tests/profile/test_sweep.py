@@ -213,7 +213,7 @@ def test_captured_setting_matches_uncaptured(case, setting):
     rendered = stepping._graph(stepping.state)
     runner = case.runner(plain)
     expected = runner.steps(case.start(runner, [0]), stepping.span)
-    assert stepping.span == len(rendered.steps) == 4 and stepping.once > 0
+    assert stepping.span == len(rendered.steps) == 4 and stepping.capture_seconds > 0
     for ours, right in zip(rendered.steps, expected, strict=True):
         torch.testing.assert_close(ours.means, right.means, rtol=0, atol=1e-5)
     image = runner.images(rendered.steps[0], case.cameras([0], 0))
