@@ -135,11 +135,11 @@ def _read_obj(path: Path, data: bytes) -> list[Piece]:
         if len(faces) == len(materials) == 1:
             name = next(iter(materials))  # whatever it is called in the other file
         if name is not None and name not in materials:
-            raise InputError(f"mesh {path}: material {name!r} stands in none of its material files: {libraries}")
+            raise InputError(f"mesh {path}: material {name!r} is in none of its material files: {libraries}")
         colour = materials.get(name)
         if isinstance(colour, np.ndarray) and colour.ndim == 3:
             if (index[..., 1] < 0).any():
-                raise InputError(f"mesh {path}: faces of material {name!r} have a texture, but no coordinates in it")
+                raise InputError(f"mesh {path}: faces of material {name!r} have a texture, but no texture coordinates")
             pieces.append(Piece(triangles, np.array(uvs)[index[..., 1]], texture_lookup(colour)))
         elif has_colours:
             pieces.append(_vertex_colours(triangles, np.array(colours)[index[..., 0]], path))
@@ -157,7 +157,7 @@ def _corner(word: str, n_vertices: int, n_uvs: int) -> tuple[int, int]:
         number = int(part) if part or not found else 0
         index = number - 1 if number > 0 else count + number
         if part and not 0 <= index < count:
-            raise ValueError(f"{word}: there are {count} before it")
+            raise ValueError(f"invalid index {word}: only {count} are defined before")
         found.append(index if part else -1)
     return found[0], found[1]
 
@@ -170,7 +170,7 @@ def _materials(path: Path, libraries: list[str]) -> dict[str, np.ndarray | None]
         for name in names:
             file = path.parent / name.replace("\\", "/")
             if not file.is_file():
-                raise InputError(f"mesh {path}: its material file {name} is not beside it")
+                raise InputError(f"mesh {path}: its material file {name} is missing")
             found |= _read_mtl(path, file)
     return found
 
@@ -195,7 +195,7 @@ def _read_mtl(path: Path, file: Path) -> dict[str, np.ndarray | None]:
             texture = words[-1] if words[0].startswith("-") else rest.strip()
             image = file.parent / texture.replace("\\", "/")
             if not image.is_file():
-                raise InputError(f"mesh {path}: texture {texture} of material {name!r} is not beside {file.name}")
+                raise InputError(f"mesh {path}: texture {texture} of material {name!r} is missing, next to {file.name}")
             found[name] = _image(read_file(image, MAX_TEXTURE), f"mesh {path}: texture {texture}")
     return found
 

@@ -205,11 +205,11 @@ def off(folder, header, colours="", faces=""):
 REFUSED = {
     "a face twice": (lambda d: write(d, vertices() + sides(1) + sides(1)), "has 12 duplicate faces"),
     "a side twice": (lambda d: write(d, vertices() + sides(1) + sides(1, [SIDES[0][::-1]] * 2)), "duplicate faces"),
-    "no material file": (lambda d: write(d, "mtllib no.mtl\nusemtl red\n" + vertices() + sides(1)), "no.mtl is not"),
+    "no material file": (lambda d: write(d, "mtllib no.mtl\nusemtl red\n" + vertices() + sides(1)), "no.mtl is"),
     "no material": (lambda d: write(d, "mtllib two.mtl\nusemtl rde\n" + vertices() + sides(1)), "material 'rde'"),
-    "a vertex too many": (lambda d: write(d, vertices() + sides(1) + "f 1 2 9\n"), "line 15: 9: there are 8 before it"),
-    "vertex 0": (lambda d: write(d, vertices() + sides(0)), "line 9: 0: there are 8"),
-    "too far back": (lambda d: write(d, vertices() + sides(-9)), "there are 8 before it"),
+    "a vertex too many": (lambda d: write(d, vertices() + sides(1) + "f 1 2 9\n"), "line 15: invalid index 9"),
+    "vertex 0": (lambda d: write(d, vertices() + sides(0)), "line 9: invalid index 0: only 8"),
+    "too far back": (lambda d: write(d, vertices() + sides(-9)), "only 8 are defined before"),
     "no number": (lambda d: write(d, "v 0 0 x\n"), "line 1: "),
     "colours out of range": (lambda d: write(d, vertices(0, (-1, 0, 0)) + sides(1)), "vertex colours must be in"),
     "an archive": (lambda d: write(d, "", "body.zip"), "the supported formats are .glb, .gltf, .obj"),
@@ -230,13 +230,13 @@ def test_load_body_refuses_what_it_would_lose(tmp_path, name):
 def test_obj_missing_textures_are_named(tmp_path):
     path = write(tmp_path, "mtllib skin.mtl\nvt 0 0\nusemtl skin\n" + vertices() + sides(1))
     (tmp_path / "skin.mtl").write_text("newmtl skin\nmap_Kd skin.png\n")
-    with pytest.raises(InputError, match="texture skin.png of material 'skin' is not beside skin.mtl"):
+    with pytest.raises(InputError, match="texture skin.png of material 'skin' is missing, next to skin.mtl"):
         load_body(path)
     (tmp_path / "skin.png").write_bytes(b"no image")
     with pytest.raises(InputError, match="texture skin.png cannot be decoded"):
         load_body(path)
     Image.fromarray(np.zeros((2, 2, 3), np.uint8)).save(tmp_path / "skin.png")
-    with pytest.raises(InputError, match="have a texture, but no coordinates"):
+    with pytest.raises(InputError, match="have a texture, but no texture coordinates"):
         load_body(path)
     (tmp_path / "skin.mtl").write_text("newmtl skin\nKd 1 red 0\n")
     with pytest.raises(InputError, match="Kd of material 'skin' must be three numbers"):
@@ -249,7 +249,7 @@ def test_mtl_comments_and_single_material(tmp_path):
     body = load_body(path)
     np.testing.assert_allclose(body.paint(body.corners[0]), [[0.25, 0.5, 1.0]] * 3)
     (tmp_path / "skin.mtl").write_text("newmtl skin\nKd 1 1 1\nnewmtl other\nKd 0 0 0\n")
-    with pytest.raises(InputError, match="material 'exported' stands in none of"):
+    with pytest.raises(InputError, match="material 'exported' is in none of"):
         load_body(path)
 
 
