@@ -91,7 +91,11 @@ class Simulation:
         self.effects = dataclasses.replace(
             spec,
             dynamics=dataclasses.replace(spec.dynamics, history=plan.history),
-            appearance=dataclasses.replace(spec.appearance, view_dependent=plan.sh_degree),
+            appearance=dataclasses.replace(
+                spec.appearance,
+                view_dependent=plan.sh_degree,
+                opacity_changes="opacity_changes" in plan.on or spec.appearance.opacity_changes,
+            ),
             outputs=OutputEffects(),
         )
         about = {"name": "state", "fps": restored.fps or 24.0}
@@ -238,7 +242,8 @@ class Simulation:
     def _choices(self) -> dict[str, tuple[str, str, dict]]:
         """Effect -> group and field of a spec, and setting -> value."""
         sleep = self.effects.dynamics.sleep or Sleep()
-        history = [2**bits for bits in range(self._simulator.config.dynamics.history_bits + 1)]
+        powers = {2**bits for bits in range(self._simulator.config.dynamics.history_bits + 1)}
+        history = sorted(powers | {self.effects.dynamics.history})
         sleeps = {policy: dataclasses.replace(sleep, policy=policy) for policy in POLICIES}
         return {
             "history": ("dynamics", "history", {f"{n} step{'s' * (n > 1)}": n for n in history}),
@@ -271,9 +276,7 @@ class Simulation:
         self.effects = known[setting]
 
     @torch.no_grad()
-    def costs(
-        self, frame: int, progress: Callable[[float], object] = lambda share: None
-    ) -> list[tuple[str, str, float]]:
+    def costs(self, frame: int, progress: Callable[[float], object] = float) -> list[tuple[str, str, float]]:
         """Effect, setting and milliseconds of a step on this machine, the other effects as they are now.
 
         Args:
@@ -281,19 +284,17 @@ class Simulation:
             progress: called with the share that is done.
         """
         history = self._history(self._step_after(max(frame, self.target.n_encoded - 1)))
-        wanted = [
-            (s.name, label, spec) for s in self.switches() if len(s.settings) > 1 for label, spec in s.settings.items()
-        ]
-        found = []
-        for done, (name, label, spec) in enumerate(wanted):
-            progress(done / len(wanted))
-            plan = self._simulator.plan(spec)
-            times: list[float] = []
+        switches = [switch for switch in self.switches() if len(switch.settings) > 1]
+        specs = {spec.hash: spec for switch in switches for spec in switch.settings.values()}
+        found: dict[str, float] = {}
+        for digest, spec in specs.items():
+            progress(len(found) / len(specs))
+            plan, times = self._simulator.plan(spec), []
             while len(times) < ROUNDS and TIMED * sum(times) < PATIENCE:
                 times.append(self._timed(history, TIMED, plan)[1])
-            found.append((name, label, 1000 * min(times)))
+            found[digest] = 1000 * min(times)
         progress(1.0)
-        return found
+        return [(one.name, label, found[spec.hash]) for one in switches for label, spec in one.settings.items()]
 
 
 def hit(gaussians: Gaussians, rows: Tensor, origin: Sequence[float], direction: Sequence[float]) -> int | None:

@@ -103,6 +103,9 @@ def test_switches_are_those_of_the_model_and_say_why_not(simulation):
     assert switches["priors"].now == "none" and "trained" in switches["priors"].why
     with pytest.raises(InputError, match="effect sleep: 'approx' is not possible; it has off, exact"):
         simulation.choose("sleep", "approx")
+    dynamics = dataclasses.replace(simulation.effects.dynamics, history=3)
+    simulation.effects = dataclasses.replace(simulation.effects, dynamics=dynamics)
+    assert {switch.name: switch.now for switch in simulation.switches()}["history"] == "3 steps"
 
 
 def test_effects_count_from_the_next_part_on(simulation):
@@ -122,6 +125,8 @@ def test_costs_are_measured_for_each_setting(simulation):
     costs = simulation.costs(3, shares.append)
     wanted = [(s.name, label) for s in simulation.switches() if len(s.settings) > 1 for label in s.settings]
     assert [cost[:2] for cost in costs] == wanted and all(ms > 0 for *_, ms in costs)
+    now = {switch.name: switch.now for switch in simulation.switches()}
+    assert len({ms for name, label, ms in costs if now[name] == label}) == 1  # one spec, timed once
     assert shares == sorted(shares) and shares[-1] == 1
     assert simulation.target.n_frames == 5
 
