@@ -13,7 +13,7 @@ SPEC.loader.exec_module(sizes)
 TODAY = {
     "lines of the package": 39_650,
     "lines of the library without io": 15_000,
-    "lines of readers, writers and the viewer": 4_480,
+    "lines of readers, writers and the viewer": 4_500,
 }
 
 

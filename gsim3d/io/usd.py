@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from gsim3d.errors import InputError
-from gsim3d.io.arrays import FIELDS, Y_TO_Z_UP, Splats, turned
+from gsim3d.io.arrays import FIELDS, Y_TO_Z_UP, Splats, read_head, turned
 from gsim3d.io.files import whole_file
 
 TYPE = "ParticleField3DGaussianSplat"
@@ -52,13 +52,24 @@ def read(path: Path) -> Splats:
     Raises:
         InputError: it is no USD file, or has no field of Gaussians.
     """
-    _, _, Usd, UsdGeom, _ = _pxr(path)
-    from pxr import Tf
-
+    read_head(path)  # a regular file
     try:
-        stage = Usd.Stage.Open(str(path))
-    except Tf.ErrorException as error:
-        raise InputError(f"{path}: not a USD file: {str(error).splitlines()[0][:100]}") from None
+        whole, is_y_up, unit = _read(path)
+    except InputError:
+        raise
+    except (RuntimeError, ValueError, TypeError, AttributeError) as error:  # RuntimeError: pxr's own, too
+        raise InputError(f"{path}: damaged, or not a USD file: {_line(error)}") from None
+    if not 0 < unit < np.inf:
+        raise InputError(f"{path}: metersPerUnit must be positive; got {unit}")
+    if is_y_up:
+        whole = turned(whole, Y_TO_Z_UP)
+    return Splats(whole.means * unit, whole.quats, whole.scales * unit, whole.opacities, whole.sh)
+
+
+def _read(path: Path) -> tuple[Splats, bool, np.float32]:
+    """The Gaussians as they stand, whether y points up, and metres a unit."""
+    _, _, Usd, UsdGeom, _ = _pxr(path)
+    stage = Usd.Stage.Open(str(path))
     time = Usd.TimeCode(stage.GetStartTimeCode()) if stage.HasAuthoredTimeCodeRange() else Usd.TimeCode.EarliestTime()
     parts = [_arrays(path, prim, time) for prim in stage.Traverse() if prim.GetTypeName() == TYPE]
     if not parts:
@@ -66,10 +77,16 @@ def read(path: Path) -> Splats:
     if len({part.degree for part in parts}) > 1:
         raise InputError(f"{path}: its fields have different degrees of harmonics")
     whole = Splats(*(np.concatenate([getattr(part, name) for part in parts]) for name in FIELDS))
-    if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y:
-        whole = turned(whole, Y_TO_Z_UP)
-    unit = np.float32(UsdGeom.GetStageMetersPerUnit(stage))
-    return Splats(whole.means * unit, whole.quats, whole.scales * unit, whole.opacities, whole.sh)
+    is_y_up = UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y
+    return whole, is_y_up, np.float32(UsdGeom.GetStageMetersPerUnit(stage))
+
+
+def _line(error: Exception) -> str:
+    """The first line of a message; pxr's may hold bytes of the file."""
+    try:
+        return next(iter(str(error).strip().splitlines()), "").rpartition(" : ")[2][:100]
+    except UnicodeDecodeError:
+        return "its text is not UTF-8"
 
 
 def _split(frames: Sequence[Splats]) -> list[tuple[str, list[Splats]]]:

@@ -11,6 +11,7 @@ import pytest
 import torch
 import trimesh
 
+from gsim3d.errors import InputError
 from gsim3d.io import read_splats, write_splats
 from tests.io.test_formats import make, moving
 
@@ -97,3 +98,28 @@ def test_usd_stores_all_where_all_moves(tmp_path):
     stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
     names = {prim.GetName() for prim in stage.Traverse()}
     assert names == {"Gaussians", "moving"}
+
+
+def damaged(text):
+    return [
+        (text[: len(text) // 2], "not a USD file"),
+        (text.replace(b"point3f[]", b"string[]", 1), "not a USD file"),
+        (text.replace(b"metersPerUnit = 1", b"metersPerUnit = 0"), "metersPerUnit must be positive"),
+        (text.replace(b"ParticleField3DGaussianSplat", b"Mesh"), "no prim is a Particle"),
+        (b"#usda 1.0\n\xff\xfe", "not a USD file"),
+        (b"", "not a USD file"),
+    ]
+
+
+def test_damaged_usd_is_refused(tmp_path):
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    file = tmp_path / "a.usda"
+    write_splats(file, make(3, 1))
+    for number, (content, says) in enumerate(damaged(file.read_bytes())):
+        other = tmp_path / f"{number}.usda"  # a stage that is open is not read again
+        other.write_bytes(content)
+        with pytest.raises(InputError, match=says):
+            read_splats(other)
+    os.mkfifo(tmp_path / "pipe.usda")
+    with pytest.raises(InputError, match="not a file"):
+        read_splats(tmp_path / "pipe.usda")

@@ -181,6 +181,7 @@ def test_player_in_browser_equals_rasterizer(tmp_path):
     truth = [(rendered(frame, seen) * 255).byte().numpy() for frame in frames]
     write_player(tmp_path / "a.html", frames, fps=FPS, view=seen, truth=truth, start=3, title="Falling")
     url = (tmp_path / "a.html").as_uri()
+    header = re.search(r'id="header">(.*?)</script>', (tmp_path / "a.html").read_text(), re.DOTALL)[1]
     with Browser(2 * SIZE + 2, SIZE + 110) as browser:
         browser.open(url)
         browser.wait("globalThis.player && player.painted !== null")
@@ -198,6 +199,8 @@ def test_player_in_browser_equals_rasterizer(tmp_path):
         for frame in (0, 6):
             browser.value(f"player.show({frame})")
             browser.wait(f"player.idle && player.painted[0] === {frame}")
+            browser.wait(f"truth.naturalWidth === {SIZE} && truth.clientWidth > {SIZE // 2}")
+            assert browser.value("truth.src").endswith(json.loads(header)["truth"][frame])
             image = canvas_of(browser)
             side = min(image.shape[:2])
             top, left = ((length - side) // 2 for length in image.shape[:2])

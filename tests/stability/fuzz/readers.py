@@ -8,7 +8,6 @@ import dataclasses
 import functools
 import gzip
 import hashlib
-import importlib.util
 import io
 import json
 import os
@@ -19,6 +18,7 @@ import tempfile
 import zipfile
 from collections.abc import Callable
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -418,10 +418,10 @@ READERS = {
         f"splats{suffix}": Reader(
             partial(_write_splats, suffix), partial(_read_splats, suffix), headless=suffix == ".splat"
         )
-        for suffix in (".splat", ".compressed.ply", ".spz", ".glb")
+        for suffix in (".splat", ".compressed.ply", ".spz", ".glb", *((".usda",) if find_spec("pxr") else ()))
     },
     "spz_unpacked": Reader(_write_unpacked_spz, _read_unpacked_spz),
-    **({"spz_4": Reader(_write_spz_4, partial(_read_splats, ".spz"))} if importlib.util.find_spec("zstandard") else {}),
+    **({"spz_4": Reader(_write_spz_4, partial(_read_splats, ".spz"))} if find_spec("zstandard") else {}),
     "state": Reader(_write_state, _read_state),
     "sequence": Reader(_write_sequence, _read_sequence, ("sequence.json",), headless=True),
     "ply_lists": Reader(lambda folder: _write_list_ply(folder / "a.ply", "binary_big_endian"), _read_ply),
