@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from gsim3d.cameras import InputSpec
 from gsim3d.cli.main import main
 from gsim3d.effects.edits import Duplicate, Move, Recolor, Remove, Throw
 from gsim3d.errors import FitWarning, InputError
@@ -19,6 +20,8 @@ from gsim3d.viewer import server
 from gsim3d.viewer.live import Layers
 from gsim3d.viewer.simulation import Simulation, hit
 from gsim3d.viewer.targets import open_state, open_target
+from tests.effects.models import EXPLICIT_CONFIG
+from tests.test_simulator import SIZE, awake, make_simulator
 from tests.viewer.test_live import falling, splats
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -106,6 +109,18 @@ def test_switches_are_those_of_the_model_and_say_why_not(simulation):
     dynamics = dataclasses.replace(simulation.effects.dynamics, history=3)
     simulation.effects = dataclasses.replace(simulation.effects, dynamics=dynamics)
     assert {switch.name: switch.now for switch in simulation.switches()}["history"] == "3 steps"
+
+
+def test_explicit_models_switch_changing_opacities(scene, tmp_path):
+    simulator = awake(make_simulator(EXPLICIT_CONFIG))
+    simulator.inputs = InputSpec(history=2, context_views=2, image_size=(SIZE, SIZE), fps=12.0)
+    restored = restore(simulator.save_pretrained(tmp_path / "model"))
+    simulation = Simulation(restored, restored.open_scene(scene), 2)
+    assert {switch.name: switch.now for switch in simulation.switches()}["opacity_changes"] == "on"
+    simulation.choose("opacity_changes", "off")
+    simulation.simulate_on(2, 2)
+    steps = simulation.target.particles[2:]
+    assert torch.equal(steps[0].opacities, steps[2].opacities) and not torch.equal(steps[0].means, steps[2].means)
 
 
 def test_effects_count_from_the_next_part_on(simulation):
