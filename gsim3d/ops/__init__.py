@@ -28,6 +28,7 @@ from gsim3d.ops.projection import Projection, project_gaussians, sh_to_color
 from gsim3d.ops.raster import Rendering, rasterize_gaussians
 from gsim3d.ops.raster_projected import rasterize_projected
 from gsim3d.ops.row_norm import norm_gelu, residual_norm, row_norm
+from gsim3d.ops.segment import segment_min, segment_softmax, segment_sum
 from gsim3d.ops.sparse_conv import sparse_conv
 from gsim3d.ops.validate_state import PartialRecord, ValidatedState, join_records, validate_state
 
@@ -67,6 +68,9 @@ __all__ = [
     "row_norm",
     "row_scenes",
     "sh_to_color",
+    "segment_min",
+    "segment_softmax",
+    "segment_sum",
     "sparse_conv",
     "sweep_geometry",
     "unpool",

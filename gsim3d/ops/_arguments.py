@@ -65,6 +65,25 @@ def check_numbers(op: str, *, largest_of: float = math.inf, **tensors: Tensor | 
             _refuse(op, name, value.detach(), largest)
 
 
+def widened(x: Tensor) -> Tensor:
+    """``x``, in float32 where it has 16 bits."""
+    return x.float() if x.dtype in (torch.float16, torch.bfloat16) else x
+
+
+def as_given(out: Tensor, x: Tensor) -> Tensor:
+    """``out`` in the dtype of ``x``; under autocast as it is."""
+    return out if torch.is_autocast_enabled(x.device.type) else out.to(x.dtype)
+
+
+def widened_on_cpu(x: Tensor, *others: Tensor | None) -> tuple[Tensor | None, ...]:
+    """``x`` and ``others``, in float32 where all have one dtype of 16 bits on the CPU and autocast does not cast."""
+    tensors = x, *others
+    same = all(t is None or t.dtype == x.dtype for t in tensors)
+    if x.device.type != "cpu" or not same or torch.is_autocast_enabled("cpu"):
+        return tensors
+    return tuple(t if t is None else widened(t) for t in tensors)
+
+
 def _refuse(op: str, name: str, value: Tensor, largest: float) -> None:
     bad = ~(value.abs() <= largest)
     row = int(bad.reshape(len(value), -1).any(1).nonzero()[0]) if value.dim() else 0

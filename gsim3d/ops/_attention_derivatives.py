@@ -10,6 +10,8 @@ The gradient of <dQ, A> + <dK, B> + <dV, C>, where dQ, dK, dV are the gradients 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -19,7 +21,8 @@ from gsim3d.ops._register import call
 class Patches:
     """Rows of queries and keys by patch, [P, longest], and back."""
 
-    def __init__(self, q_rows: Tensor, kv_rows: Tensor, cu_q: Tensor, cu_k: Tensor, n_q: int, n_k: int):
+    def __init__(self, lists: Sequence[Tensor], n_q: int, n_k: int):
+        q_rows, kv_rows, cu_q, cu_k = lists
         self.n_q, self.n_k = n_q, n_k
         self.queries, self.has_query = _padded(q_rows, cu_q, n_q)
         self.keys, self.has_key = _padded(kv_rows, cu_k, n_k)
@@ -80,7 +83,7 @@ def tangent(q, k, v, by_q, by_k, by_v, lists, scale: float) -> Tensor:
     """O' [Nq, H, D] along a direction (by_q, by_k, by_v), of which some may be None."""
     dtype = q.dtype
     q, k, v, by_q, by_k, by_v = _wide(q, k, v, by_q, by_k, by_v)
-    patches = Patches(*lists, q.shape[0], k.shape[0])
+    patches = Patches(lists, q.shape[0], k.shape[0])
     q, k, v = patches.of_queries(q), patches.of_keys(k), patches.of_keys(v)
     weights = patches.softmax(scale * q @ k.mT)
     moved = torch.zeros_like(weights)
@@ -98,7 +101,7 @@ def gradients_of_gradients(grad, q, k, v, by_q, by_k, by_v, lists, scale: float)
     """The gradients of <dQ, by_q> + <dK, by_k> + <dV, by_v> with respect to grad, q, k and v."""
     dtype = q.dtype
     grad, q, k, v, by_q, by_k, by_v = _wide(grad, q, k, v, by_q, by_k, by_v)
-    patches = Patches(*lists, q.shape[0], k.shape[0])
+    patches = Patches(lists, q.shape[0], k.shape[0])
     grad, q, by_q = map(patches.of_queries, (grad, q, by_q))
     k, v, by_k, by_v = map(patches.of_keys, (k, v, by_k, by_v))
     weights, by_weights = patches.softmax(scale * q @ k.mT), grad @ v.mT

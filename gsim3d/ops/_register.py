@@ -27,12 +27,11 @@ def fake(name: str) -> Callable[[Callable], Callable]:
     return torch.library.register_fake(f"gsim3d::{name}")
 
 
-def alias(op: str, *, of: str) -> None:
-    """Defines gsim3d::``op``, which computes what gsim3d::``of`` does and may have other gradients."""
-    overload = getattr(torch.ops.gsim3d, of)
-    _library.define(str(overload.default._schema).removeprefix("gsim3d::").replace(of, op, 1))
-    _library.impl(op, lambda *arguments: overload(*arguments), "CPU")
-    _library.impl(op, lambda *arguments: overload(*arguments), "CUDA")
+def define(schema: str, kernel: Callable) -> None:
+    """Defines gsim3d::``schema``, which ``kernel`` computes by other operations on any device."""
+    _library.define(schema)
+    for device in ("CPU", "CUDA"):
+        _library.impl(schema.partition("(")[0], kernel, device)
 
 
 def register_gradients(

@@ -11,6 +11,7 @@ from itertools import accumulate
 import torch
 from torch import Tensor
 
+from gsim3d.ops import _neighbours as neighbours
 from gsim3d.ops._arguments import check_real, check_tensors, check_whole
 from gsim3d.ops._register import fake
 from gsim3d.ops.streams import MANY_STREAMS, Streams
@@ -166,6 +167,10 @@ class KernelMap:
         tap_out: int64 [L].
         cu_taps: int64 [K^3 + 1].
         plan: int32, what 16-bit convolutions on CUDA derive from the pairs, made once; None: made anew in each.
+        shape: taps an axis of the weight; None: K each.
+        outputs: int64 [M, 4], batch and cell of the outputs of a convolution with stride; None: outputs are the inputs.
+            Voxels are then those of the N inputs and behind them the M outputs, taps are counted around the centre.
+        inverted: from the outputs back to the inputs.
     """
 
     kernel_size: int
@@ -173,6 +178,58 @@ class KernelMap:
     tap_out: Tensor
     cu_taps: Tensor
     plan: Tensor | None = None
+    shape: tuple[int, int, int] | None = None
+    outputs: Tensor | None = None
+    inverted: bool = False
+
+    @classmethod
+    def from_indices(
+        cls,
+        indices: Tensor,
+        kernel_size: int | tuple[int, int, int] = 3,
+        *,
+        stride: int | tuple[int, int, int] | None = None,
+        padding: int | tuple[int, int, int] = 0,
+        dilation: int | tuple[int, int, int] = 1,
+        spatial_shape: tuple[int, int, int] | None = None,
+    ) -> tuple[Voxels, KernelMap]:
+        """The geometry of a convolution over a list of cells, as spconv has it.
+
+        Args:
+            indices: int32 or int64 [N, 4], in [0, 2^15): batch, then a cell. Rows may share a cell.
+            kernel_size: taps an axis; odd ones where there is no stride.
+            stride: None: outputs are the inputs (submanifold). Else outputs are the cells o that a tap reaches from an
+                input: ``o stride + tap dilation - padding`` is its cell.
+            padding: of a convolution with stride.
+            dilation: cells between taps.
+            spatial_shape: cells an axis of the inputs, which bound the outputs of a stride; None: o >= 0 alone does.
+        Returns:
+            voxels and kernel map for :func:`sparse_conv`; with a stride, ``kernel_map.outputs`` are the outputs' cells.
+            CUDA waits for their number.
+        Raises:
+            TypeError, ValueError: an argument is malformed; the message names it.
+
+        Example:
+            >>> indices = torch.tensor([[0, 0, 0, 0], [0, 1, 0, 0], [0, 2, 0, 1]])
+            >>> voxels, kernel_map = KernelMap.from_indices(indices, 2, stride=2)
+            >>> kernel_map.outputs
+            tensor([[0, 0, 0, 0],
+                    [0, 1, 0, 0]])
+        """
+        made = neighbours.geometry(indices, kernel_size, stride, padding, dilation, spatial_shape)
+        tap_in, tap_out, cu_taps = made.pairs
+        own = cls(made.edge, tap_in, tap_out, cu_taps, shape=made.kernel, outputs=made.outputs)
+        return Voxels(*made.voxels), own
+
+    def inverse(self) -> KernelMap:
+        """The same pairs the other way: from the outputs of a convolution with stride back to its inputs.
+
+        Raises:
+            ValueError: it has no stride.
+        """
+        if self.outputs is None:
+            raise ValueError("KernelMap.inverse: only a convolution with stride has an inverse")
+        return dataclasses.replace(self, tap_in=self.tap_out, tap_out=self.tap_in, inverted=not self.inverted)
 
 
 @dataclass(frozen=True)

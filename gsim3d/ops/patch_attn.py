@@ -3,15 +3,22 @@
 import torch
 from torch import Tensor
 
-from gsim3d.ops._arguments import check_numbers, check_real, check_tensors
+from gsim3d.ops._arguments import as_given, check_numbers, check_real, check_tensors, widened_on_cpu
 from gsim3d.ops._attention_derivatives import gradients_of_gradients, tangent
-from gsim3d.ops._register import alias, call, fake, one_by_one, register_autocast, register_gradients
+from gsim3d.ops._register import call, define, fake, one_by_one, register_autocast, register_gradients
 from gsim3d.ops.curve import PatchTable
 
 
 def patch_attention(
-    q: Tensor, k: Tensor, v: Tensor, table: PatchTable, *, scale: float | None = None, check: bool = True
-) -> Tensor:
+    q: Tensor,
+    k: Tensor,
+    v: Tensor,
+    table: PatchTable,
+    *,
+    scale: float | None = None,
+    return_lse: bool = False,
+    check: bool = True,
+) -> Tensor | tuple[Tensor, Tensor]:
     """Softmax attention of every query row over the key rows of its patch.
 
     ``out[i] = sum_j softmax_j(scale * <q[i], k[j]>) v[j]`` for each head, over the keys ``j`` in
@@ -19,16 +26,17 @@ def patch_attention(
     A query row that no patch lists, or whose patch has no keys, gets 0.
 
     Args:
-        q: queries [Nq, H, D], float32 or float64, on CUDA also bfloat16 and float16 (their softmax and sums are
-            float32); D a multiple of 4 from 4 to 128, fastest 16, 32 and 64. Under ``torch.autocast`` CUDA computes in
-            its dtype and the CPU in float32.
-        k, v: keys and values [Nk, H, D]. The three may be views of one qkv tensor; they are read in place.
-        table: patches; a row at most once in ``q_rows``, any number of times in ``kv_rows``. What the lists hold behind
-            the last offsets is in no patch.
+        q: queries [Nq, H, D], floating point (softmax and sums of 16-bit ones are float32); D a multiple of 4 from 4 to
+            128, fastest 16, 32 and 64. Under ``torch.autocast`` CUDA computes in its dtype and the CPU in float32.
+        k, v: keys and values [Nk, H, D]. The three may be views of one qkv tensor; they are read in place. Or
+            [Nk, H / G, D]: head h of the queries reads head h // G.
+        table: patches, int64 or int32; a row at most once in ``q_rows``, any number of times in ``kv_rows``. What the
+            lists hold behind the last offsets is in no patch.
         scale: factor of the dot products; default ``D ** -0.5``.
+        return_lse: whether the logarithms of the sums of exp(scale <q, k>) are returned too, float32 or float64.
         check: look for numbers that cannot be used, on the CPU; a model that guards its numbers itself leaves it out.
     Returns:
-        [Nq, H, D], dtype of ``q``.
+        [Nq, H, D], dtype of ``q``; with ``return_lse`` and lse [Nq, H], -inf where there are no keys.
     Gradients:
         ``q``, ``k`` and ``v``, to any order and in forward mode. Beyond the first order in reverse mode the scores of
         all patches are stored.
@@ -53,7 +61,21 @@ def patch_attention(
         check_tensors("patch_attention", q=q, k=k, v=v, **_lists(table))
         check_real("patch_attention", **({} if scale is None else {"scale": scale}))
         check_numbers("patch_attention", q=q, k=k, v=v)
-    return call("patch_attention", q, k, v, *_lists(table).values(), _scale(q, scale))[0]
+    given, scale = q, _scale(q, scale)
+    q, k, v = widened_on_cpu(q, *_for_each_head(q, k, v))
+    lists = [rows.long() if rows.dtype == torch.int32 else rows for rows in _lists(table).values()]
+    out, stats = call("patch_attention", q, k, v, *lists, scale)
+    out = as_given(out, given)
+    return (out, call("attention_log_sum_exp", stats, q, k, *lists, scale)) if return_lse else out
+
+
+def _for_each_head(q: Tensor, k: Tensor, v: Tensor) -> list[Tensor]:
+    """Keys and values with a head for each one of the queries."""
+    if any(x.dim() != 3 for x in (q, k, v)) or k.shape[1] in (0, q.shape[1]) or k.shape[1] != v.shape[1]:
+        return [k, v]
+    if q.shape[1] % k.shape[1]:
+        raise ValueError(f"patch_attention: k must have H={q.shape[1]} heads or a divisor of it; got {k.shape[1]}")
+    return [x.repeat_interleave(q.shape[1] // k.shape[1], 1) for x in (k, v)]
 
 
 def joint_attention(
@@ -114,7 +136,20 @@ def _(q, k, v, q_rows, kv_rows, cu_q, cu_k, scale):
 
 
 # The same computation; what it returns there is not the whole gradient, so that it has none itself.
-alias("joint_attention_backward", of="patch_attention_backward")
+define(
+    str(torch.ops.gsim3d.patch_attention_backward.default._schema).replace("gsim3d::patch", "joint", 1),
+    torch.ops.gsim3d.patch_attention_backward.default,
+)
+define(
+    "attention_log_sum_exp(Tensor stats, Tensor q, Tensor k, Tensor q_rows, Tensor kv_rows, Tensor cu_q, Tensor cu_k, "
+    "float scale) -> Tensor",
+    lambda stats, q, k, q_rows, kv_rows, cu_q, cu_k, scale: stats[..., 1].log() + abs(scale) * stats[..., 0],
+)
+
+
+@fake("attention_log_sum_exp")
+def _(stats, q, k, q_rows, kv_rows, cu_q, cu_k, scale):
+    return stats.new_empty(stats.shape[:2])
 
 
 @fake("joint_attention_backward")
@@ -179,6 +214,32 @@ def _one_after_another(size, q_rows, kv_rows, cu_q, cu_k, n_q, n_k):
     return (q_rows + n_q * entry).flatten(), (kv_rows + n_k * entry).flatten(), cu_q.flatten(), cu_k.flatten()
 
 
+# With P the softmax of the scores, the gradient of the log-sum-exp is scale P K for queries, scale P^T Q for keys.
+
+
+def _lse_setup(ctx, inputs, output):
+    _, *tensors, ctx.scale = inputs
+    ctx.save_for_backward(*tensors)
+
+
+def _lse_backward(ctx, grad):
+    q, k, *lists = ctx.saved_tensors
+    mean, stats = call("patch_attention", q, k, k, *lists, ctx.scale)
+    scaled = (ctx.scale * grad)[..., None].to(q.dtype)
+    by_k = call("patch_attention_backward", scaled * q, q, k, k, mean, stats, *lists, ctx.scale)[2]
+    return None, scaled * mean, by_k, *(None,) * 5
+
+
+def _lse_jvp(inputs, tangents, outputs):
+    (_, q, k, *lists, scale), (_, by_q, by_k, *_) = inputs, tangents
+    total = torch.zeros_like(outputs[0])
+    if by_q is not None:
+        total = total + scale * (by_q * call("patch_attention", q, k, k, *lists, scale)[0]).sum(-1)
+    if by_k is not None:
+        total = total + scale * (q * call("patch_attention", q, k, by_k, *lists, scale)[0]).sum(-1)
+    return total
+
+
 @fake("joint_attention")
 def _(q, k, v, other_k, other_v, *lists_and_scale):
     stats_dtype = torch.promote_types(q.dtype, torch.float32)
@@ -215,6 +276,14 @@ register_gradients(
 register_gradients(
     "patch_attention_backward", _gradient_backward, _gradient_setup, batched=_batched("patch_attention_backward", 6)
 )
+register_gradients(
+    "attention_log_sum_exp",
+    _lse_backward,
+    _lse_setup,
+    jvp=_lse_jvp,
+    batched=one_by_one("attention_log_sum_exp"),
+)
 register_gradients("joint_attention", _joint_backward, _joint_setup, gradient_ops=["joint_attention_backward"])
 for _name in ("patch_attention", "joint_attention"):
     register_autocast(_name, "follow")
+register_autocast("attention_log_sum_exp", "float32")

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from gsim3d.ops._arguments import check_numbers, check_tensors, check_whole, within_memory
+from gsim3d.ops._arguments import as_given, check_numbers, check_tensors, check_whole, widened, within_memory
 from gsim3d.ops._register import call, fake, folded_segments, one_by_one, register_autocast, register_gradients
 
 
@@ -14,7 +14,7 @@ def pool_max(x: Tensor, rows: Tensor, cu_rows: Tensor, *, check: bool = True) ->
     ``out[s, c] = max(x[rows[i], c] for i in range(cu_rows[s], cu_rows[s + 1]))``; 0 where a segment is empty.
 
     Args:
-        x: features [N, C], float32 or float64.
+        x: features [N, C], floating point; 16-bit ones are computed in float32.
         rows: int64 [R], the rows of segment 0, then of segment 1, ...; each row at most once.
         cu_rows: int64 [M + 1], ascending offsets into ``rows`` from 0 to at most R; rows listed behind are in none.
         check: look for numbers that cannot be used, on the CPU; a model that guards its numbers itself leaves it out.
@@ -38,14 +38,14 @@ def pool_max(x: Tensor, rows: Tensor, cu_rows: Tensor, *, check: bool = True) ->
     if check:
         check_tensors("pool_max", x=x, rows=rows, cu_rows=cu_rows)
         check_numbers("pool_max", x=x)
-    return call("pool_max", x, rows, cu_rows)[0]
+    return as_given(call("pool_max", widened(x), rows, cu_rows)[0], x)
 
 
 def pool_mean(x: Tensor, rows: Tensor, cu_rows: Tensor, *, check: bool = True) -> Tensor:
     """Mean over segments of rows; 0 where a segment is empty.
 
     Args:
-        x: features [N, C], float32 or float64.
+        x: features [N, C], floating point; 16-bit ones are computed in float32.
         rows: int64 [R], as in :func:`pool_max`.
         cu_rows: int64 [M + 1], as in :func:`pool_max`.
         check: as in :func:`pool_max`.
@@ -63,7 +63,7 @@ def pool_mean(x: Tensor, rows: Tensor, cu_rows: Tensor, *, check: bool = True) -
     if check:
         check_tensors("pool_mean", x=x, rows=rows, cu_rows=cu_rows)
         check_numbers("pool_mean", x=x)
-    return call("pool_mean", x, rows, cu_rows)
+    return as_given(call("pool_mean", widened(x), rows, cu_rows), x)
 
 
 def unpool(x: Tensor, rows: Tensor, cu_rows: Tensor, n_rows: int, *, check: bool = True) -> Tensor:
@@ -89,7 +89,8 @@ def unpool(x: Tensor, rows: Tensor, cu_rows: Tensor, n_rows: int, *, check: bool
         check_tensors("unpool", x=x, rows=rows, cu_rows=cu_rows)
         check_whole("unpool", n_rows=n_rows)
         check_numbers("unpool", x=x)
-    return within_memory("unpool", f"n_rows={n_rows}", call, "unpool", x, rows, cu_rows, n_rows)
+    out = within_memory("unpool", f"n_rows={n_rows}", call, "unpool", widened(x), rows, cu_rows, n_rows)
+    return as_given(out, x)
 
 
 @fake("pool_max")

@@ -2,8 +2,9 @@
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
-from gsim3d.ops._arguments import check_numbers, check_tensors, check_whole
+from gsim3d.ops._arguments import as_given, check_numbers, check_tensors, check_whole, widened, widened_on_cpu
 from gsim3d.ops._register import call, fake, one_by_one, register_autocast, register_gradients
 from gsim3d.ops.curve import KernelMap, Voxels
 
@@ -25,18 +26,19 @@ def sparse_conv(
     the mean of its rows, or its lowest row. Rows that share a voxel keep their own centre term.
 
     Args:
-        x: features [N, C_in], float32 or float64; on CUDA also float16 and bfloat16, summed in float32. Under
-            ``torch.autocast`` the CPU computes in float32, CUDA in autocast's dtype.
-        weight: [C_out, K, K, K, C_in], K odd; axes 1 to 3 walk x, y, z.
+        x: features [N, C_in], floating point; 16-bit ones are summed in float32. Under ``torch.autocast`` the CPU
+            computes in float32, CUDA in autocast's dtype. N of a map with stride: inputs; inverted: outputs.
+        weight: [C_out, Kx, Ky, Kz, C_in]; axes 1 to 3 walk x, y, z.
         bias: [C_out] or None.
-        voxels: which rows share a voxel (``Stage.voxels`` of :func:`gsim3d.ops.build_pyramid`). Where there are more
+        voxels: which rows share a voxel (``Stage.voxels`` of :func:`gsim3d.ops.build_pyramid`, or of
+            :meth:`KernelMap.from_indices`). Where there are more
             voxels than rows, the last ones are empty.
         kernel_map: pairs of neighbouring voxels for K (``Stage.kernel_maps[K]``); those behind the last offset take no
             part.
         duplicates: "mean", or "first" for the lowest row, which depends on the order of the rows.
         check: look for numbers that cannot be used, on the CPU; a model that guards its numbers itself leaves it out.
     Returns:
-        [N, C_out], dtype of ``x``.
+        [N, C_out], dtype of ``x``; of a map with stride [M, C_out], its outputs; inverted, its inputs.
     Gradients:
         ``x``, ``weight``, ``bias``, to any order and in forward mode.
     Determinism:
@@ -67,11 +69,57 @@ def sparse_conv(
         check_tensors("sparse_conv", **floats, **lists, **taps)
         check_whole("sparse_conv", kernel_size=kernel_map.kernel_size)
         check_numbers("sparse_conv", **floats)
-    kernel_size = kernel_map.kernel_size
-    if weight.dim() == 5 and weight.shape[1] != kernel_size:
-        raise ValueError(
-            f"sparse_conv: kernel_map must have the weight's kernel size {weight.shape[1]}; got {kernel_size}"
-        )
+    if weight.dim() == 5:
+        own, wanted = weight.shape[1], kernel_map.kernel_size
+        if kernel_map.shape is not None:
+            own, wanted = tuple(weight.shape[1:4]), kernel_map.shape
+        if own != wanted:
+            raise ValueError(f"sparse_conv: kernel_map must have the weight's kernel size {own}; got {wanted}")
+    given = x
+    x, weight, bias = widened_on_cpu(x, weight, bias)
+    if kernel_map.outputs is not None:
+        return as_given(_strided(x, weight, bias, voxels, kernel_map, duplicates == "first"), given)
+    if kernel_map.shape is not None and weight.dim() == 5:
+        weight = _in_the_middle(weight, kernel_map.kernel_size)
+    return as_given(_convolved(x, weight, bias, voxels, kernel_map, duplicates == "first"), given)
+
+
+def _strided(x, weight, bias, voxels: Voxels, kernel_map: KernelMap, first: bool) -> Tensor:
+    """Inputs and outputs are rows of one matrix, of which one part is 0 and the other is left out.
+
+    In float32 or wider: 16-bit kernels on CUDA want pairs that have mirror images.
+    """
+    n_outputs = kernel_map.outputs.shape[0]
+    n_inputs = voxels.row_voxel.shape[0] - n_outputs
+    before, behind = (n_inputs, 0) if kernel_map.inverted else (0, n_outputs)
+    expected = n_outputs if kernel_map.inverted else n_inputs
+    if x.dim() != 2 or x.shape[0] != expected:
+        raise ValueError(f"sparse_conv: x must be [{expected}, C_in], of the rows of kernel_map; got {list(x.shape)}")
+    if weight.dim() != 5:
+        raise ValueError(f"sparse_conv: weight must be [C_out, Kx, Ky, Kz, C_in]; got {list(weight.shape)}")
+    with torch.autocast(x.device.type, enabled=False):
+        x, weight, bias = (t if t is None else widened(t) for t in (x, weight, bias))
+        x, weight = F.pad(x, (0, 0, before, behind)), _around_the_centre(weight, kernel_map.kernel_size)
+        out = _convolved(x, weight, bias, voxels, kernel_map, first)
+    return out[:n_inputs] if kernel_map.inverted else out[n_inputs:]
+
+
+def _in_the_middle(weight: Tensor, cube: int) -> Tensor:
+    """A kernel of odd edges inside a cube."""
+    margins = [(cube - k) // 2 for k in weight.shape[3:0:-1]]
+    return F.pad(weight, (0, 0, *(m for m in margins for _ in range(2))))
+
+
+def _around_the_centre(weight: Tensor, cube: int) -> Tensor:
+    """The taps of a kernel as the first ones of a cube but for its centre, which is 0."""
+    taps, centre = weight.flatten(1, 3), cube**3 // 2
+    first, last = taps[:, :centre], taps[:, centre:]
+    first = F.pad(first, (0, 0, 0, centre + 1 - first.shape[1]))
+    last = F.pad(last, (0, 0, 0, cube**3 - centre - 1 - last.shape[1]))
+    return torch.cat([first, last], 1).unflatten(1, (cube, cube, cube))
+
+
+def _convolved(x, weight, bias, voxels: Voxels, kernel_map: KernelMap, first: bool) -> Tensor:
     return call(
         "sparse_conv",
         x,
@@ -83,7 +131,7 @@ def sparse_conv(
         kernel_map.tap_in,
         kernel_map.tap_out,
         kernel_map.cu_taps,
-        duplicates == "first",
+        first,
         kernel_map.plan,
     )
 

@@ -66,6 +66,10 @@ CALLS = {
         lambda q, k, v: ops.patch_attention(q, k, v, TABLE),
         [values(6, 1, 4, seed=s) for s in range(3)],
     ),
+    "attention_log_sum_exp": (
+        lambda q, k: ops.patch_attention(q, k, k, TABLE, return_lse=True)[1],
+        [values(6, 1, 4, seed=s) for s in range(2)],
+    ),
     "joint_attention": (
         lambda *x: ops.joint_attention(*x, TABLE, TABLE),
         [values(6, 1, 4, seed=s) for s in range(5)],
@@ -93,7 +97,7 @@ CALLS = {
 
 
 # What these have beyond the first order is in test_transforms.py.
-HIGHER = {"pool_max", "pool_mean", "unpool", "sparse_conv", "patch_attention"}
+HIGHER = {"pool_max", "pool_mean", "unpool", "sparse_conv", "patch_attention", "attention_log_sum_exp"}
 FIRST_ORDER = sorted(CALLS.keys() - HIGHER)
 ONCE = [op for op in FIRST_ORDER if op != "add_cells"]  # its gradient is a sum, which has one
 

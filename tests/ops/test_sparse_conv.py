@@ -557,7 +557,7 @@ def test_malformed_arguments_raise(wrong, message):
         sparse_conv(**arguments, voxels=voxels, kernel_map=kernel_map)
 
 
-def test_float16_is_refused():
+def test_integers_are_refused():
     voxels, kernel_map = two_neighbours()
-    with pytest.raises(ValueError, match="sparse_conv: x must be float32 or float64; got float16"):
-        sparse_conv(torch.zeros(3, 2).half(), torch.zeros(4, 3, 3, 3, 2).half(), None, voxels, kernel_map)
+    with pytest.raises(ValueError, match="sparse_conv: x must be float32 or float64; got int32"):
+        sparse_conv(torch.zeros(3, 2).int(), torch.zeros(4, 3, 3, 3, 2).int(), None, voxels, kernel_map)

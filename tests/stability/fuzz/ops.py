@@ -228,6 +228,11 @@ def _pool(rng: random.Random) -> Arguments:
     }
 
 
+def _segment(rng: random.Random) -> Arguments:
+    n = _size(rng)
+    return {"x": tensor(rng, n, 3, dtype=_dtype(rng)), "cu_rows": _offsets(rng, n, rng.choice((0, 1, 3)) if n else 0)}
+
+
 def _unpool(rng: random.Random) -> Arguments:
     arguments = _pool(rng)
     n, segments = len(arguments["x"]), len(arguments["cu_rows"]) - 1
@@ -418,6 +423,9 @@ OPS: dict[str, tuple[Callable[[random.Random], Arguments], Callable[[Arguments],
     "pool_max": (_pool, lambda a: ops.pool_max(**a)),
     "pool_mean": (_pool, lambda a: ops.pool_mean(**a)),
     "unpool": (_unpool, lambda a: ops.unpool(**a)),
+    "segment_sum": (_segment, lambda a: ops.segment_sum(**a)),
+    "segment_min": (_segment, lambda a: ops.segment_min(**a)),
+    "segment_softmax": (_segment, lambda a: ops.segment_softmax(**a)),
     "row_norm": (_row_norm, lambda a: ops.row_norm(**a)),
     "residual_norm": (_residual_norm, _call_residual_norm),
     "validate_state": (_validate_state, _call_validate_state),
