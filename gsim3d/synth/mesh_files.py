@@ -117,6 +117,8 @@ def _read_obj(path: Path, data: bytes) -> list[Piece]:
                 uvs.append([float(x) for x in (*words, "0")[:2]])
             elif key == "f":
                 corners = [_corner(word, len(vertices), len(uvs)) for word in words]
+                if len(corners) < 3:
+                    raise ValueError("a face needs three corners")
                 fan = [(corners[0], corners[i], corners[i + 1]) for i in range(1, len(corners) - 1)]
                 faces.setdefault(material, []).extend(fan)
             elif key == "usemtl":

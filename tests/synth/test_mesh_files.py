@@ -208,6 +208,7 @@ REFUSED = {
     "no material file": (lambda d: write(d, "mtllib no.mtl\nusemtl red\n" + vertices() + sides(1)), "no.mtl is"),
     "no material": (lambda d: write(d, "mtllib two.mtl\nusemtl rde\n" + vertices() + sides(1)), "material 'rde'"),
     "a vertex too many": (lambda d: write(d, vertices() + sides(1) + "f 1 2 9\n"), "line 15: invalid index 9"),
+    "an edge": (lambda d: write(d, vertices() + "f 1 2\n"), "line 9: a face needs three corners"),
     "vertex 0": (lambda d: write(d, vertices() + sides(0)), "line 9: invalid index 0: only 8"),
     "too far back": (lambda d: write(d, vertices() + sides(-9)), "only 8 are defined before"),
     "no number": (lambda d: write(d, "v 0 0 x\n"), "line 1: "),

@@ -58,7 +58,7 @@ def _check_tree(tree) -> None:
         for value in tree.values():
             _check_tree(value)
     elif not (isinstance(tree, np.ndarray) and tree.dtype == np.float32):
-        raise InputError(f"weights must be float32 arrays in dicts; got {type(tree).__name__}")
+        raise InputError(f"the pickle holds a {type(tree).__name__}: weights must be float32 arrays in dicts")
 
 
 def lpips_tensors(tree: dict) -> dict[str, Tensor]:
