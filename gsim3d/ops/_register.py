@@ -203,9 +203,20 @@ def _register(name: str, op: str, info: Info, without: Sequence[str]) -> None:
         refuse(op, dict(zip(names, arguments)), forward_only=True)
         if without:
             refuse(op, {name: value for name, value in zip(names, arguments) if name in without})
+        _refuse_transforms(op, arguments)
         return rule(keyset, *arguments)
 
     _library.impl(name, kernel, "Autograd", with_keyset=True)
+
+
+def _refuse_transforms(op: str, arguments: Sequence[Any]) -> None:
+    """Raises GradientError inside ``torch.func.grad`` and the like; those that an op has do not come here."""
+    if not torch._C._are_functorch_transforms_active() or torch.compiler.is_compiling() or not torch.is_grad_enabled():
+        return
+    if any(isinstance(x, Tensor) and x.requires_grad for x in arguments):
+        raise GradientError(
+            f"{op}: has no transforms of torch.func; use torch.autograd.grad", op=op, argument=None, order=1
+        )
 
 
 def _second_derivative_of(op: str) -> Callable:

@@ -134,6 +134,14 @@ def test_forward_mode_is_refused(op):
             of_one(forward_ad.make_dual(x, torch.ones_like(x)))
 
 
+@pytest.mark.parametrize("op", FIRST_ORDER)
+def test_transforms_are_refused(op):
+    function, inputs = CALLS[op]
+    with pytest.raises(GradientError, match="has no transforms of torch.func") as caught:
+        torch.func.grad(lambda x: function(x, *inputs[1:]).sum())(inputs[0])
+    assert caught.value.order == 1
+
+
 @pytest.mark.parametrize("op", ONCE)
 def test_second_derivatives_are_refused(op):
     function, inputs = CALLS[op]
