@@ -55,7 +55,7 @@ def test_plan_command_reports_background_cost(capsys, tmp_path):
     code, out, err = call(capsys, "plan", scene, run)
     assert code == 0, err
     assert re.search(r"^background +switch +computed once a rollout$", out, re.MULTILINE)
-    assert float(re.search(r"^and of the background, once a rollout: (\d+\.\d)$", out, re.MULTILINE)[1]) > 0
+    assert float(re.search(r"^background, once per rollout: (\d+\.\d)$", out, re.MULTILINE)[1]) > 0
 
 
 def test_plan_command_predicts_milliseconds(capsys, work):  # noqa: F811
@@ -68,7 +68,7 @@ def test_plan_command_predicts_milliseconds(capsys, work):  # noqa: F811
     code, out, _ = call(capsys, "plan", scene, run)
     (run / autotune.SPEEDS_FILE).unlink()
     assert code == 0 and out.startswith(before)
-    assert "predicted milliseconds on cpu, from those that gsim3d profile measured (a clock)\n" in out
+    assert "predicted milliseconds on cpu, scaled from gsim3d profile's measurement (a clock)\n" in out
     table = re.findall(r"^(\w+) +(\d+\.\d) +\d+\.\d +\d\.\d\d$", out[len(before) :], re.MULTILINE)
     assert table == [("dynamics", "8.0"), ("gaussians", "4.0"), ("images", "2.0"), ("all", "14.0")]
 
@@ -93,7 +93,7 @@ def test_infer_command_writes_smallest_spec(capsys, work, tmp_path, monkeypatch)
     (scene / "effects.yaml").unlink()
     assert code == 0
     first = re.match(
-        r"ball/0000: (\d+\.\d\d) dB with what the checkpoint has on, (\d+\.\d\d) dB with particles held", out
+        r"ball/0000: (\d+\.\d\d) dB with the checkpoint's effects, (\d+\.\d\d) dB with constant particles", out
     )
     proposed = re.search(r"^proposed: (\d+\.\d\d) dB \(([+-]\d+\.\d+)\)", out, re.MULTILINE)
     assert abs(float(first[2]) - float(first[1])) < 3, "an untrained model hardly moves anything"
