@@ -11,10 +11,11 @@ from torch import Tensor
 
 from gsim3d._core import constants
 from gsim3d.cameras import Cameras
+from gsim3d.errors import GradientError
 from gsim3d.numerics.policy import OnInvalid, check_on_invalid
 from gsim3d.numerics.report import Finding, Reading, StabilityReport
 from gsim3d.ops._arguments import check_floating, check_real, check_tensors, check_whole, within_memory
-from gsim3d.ops._register import fake, register_autocast, register_gradients
+from gsim3d.ops._register import call, fake, one_by_one, register_autocast, register_gradients
 
 OP = "rasterize_gaussians"
 LARGEST: float = constants["raster_largest"]
@@ -91,13 +92,14 @@ def rasterize_gaussians(
             CPU, left out on a GPU; "drop": left out, its gradients are 0; "clamp": bounded, NaN counts as 0
             (rotation: identity).
         report: counts such rows by image; on a GPU its ``check()`` raises what "raise" could not. Without one a GPU
-            does not count.
+            does not count. Under ``torch.func`` nothing is counted, and such rows are left out.
     Returns:
         Rendering, dtype of ``means``.
     Gradients:
         means, quats, scales, opacities, sh or colors, features, background, ``cameras.viewmats`` (its 12 upper
-        entries taken as free numbers); once. A Gaussian gets none from a pixel where its alpha is cut to 0.99, and its
-        colour none where it was clamped at 0.
+        entries taken as free numbers): once, also under ``torch.func`` (grad, vjp, vmap); on the CPU twice, and in
+        forward mode. A Gaussian gets none from a pixel where its alpha is cut to 0.99, and its colour none where it
+        was clamped at 0.
     Determinism:
         equal bits for any number of threads, forward and backward; on a GPU from run to run.
     GPU: nothing waits for the device. Its memory is made for Gaussians of a few pixels and clouds shown by equally many
@@ -137,7 +139,7 @@ def rasterize_gaussians(
     real = torch.float64 if means.dtype == torch.float64 else torch.float32
     if cu_rows is None:
         cu_rows = torch.tensor([0, n], device=means.device)
-    watch = not compiling and (report is not None or (on_invalid == "raise" and means.device.type == "cpu"))
+    watch = not compiling and _is_watched(on_invalid, report, means)
     args = (
         *rows.values(),
         _of_each_image(background, n_images, means, real),
@@ -157,12 +159,18 @@ def rasterize_gaussians(
         out = torch.ops.gsim3d.rasterize_gaussians(*args)
     else:
         size = f"cameras.width={cameras.width}, cameras.height={cameras.height}"
-        out = within_memory(OP, size, torch.ops.gsim3d.rasterize_gaussians, *args)
+        out = within_memory(OP, size, call, OP, *args)
     if watch:
         action = "error" if on_invalid == "raise" else "dropped"
         read = partial(_unusable, names=(*rows, "scales", "scales", "cameras"), action=action)
         (StabilityReport() if report is None else report).record(out[7], read, counts=range(0, out[7].numel(), 2))
     return Rendering(out[0], out[1], out[2], None if features is None else out[3])
+
+
+def _is_watched(on_invalid: OnInvalid, report: StabilityReport | None, means: Tensor) -> bool:
+    """Whether rows that cannot be used are counted; under ``torch.func`` there are no numbers to read."""
+    wanted = report is not None or (on_invalid == "raise" and means.device.type == "cpu")
+    return wanted and not torch._C._are_functorch_transforms_active()
 
 
 def _of_each_image(background: Tensor | None, n_images: int, means: Tensor, dtype: torch.dtype) -> Tensor:
@@ -316,10 +324,90 @@ def _backward(ctx, *grads):
         for grad, size in zip(grads, sizes, strict=False)
     ]
     viewmats_grad = ctx.needs_input_grad[7]
-    *grads, viewmats = torch.ops.gsim3d.rasterize_gaussians_backward(*images, *saved, *ctx.options, viewmats_grad)
+    *grads, viewmats = call("rasterize_gaussians_backward", *images, *saved, *ctx.options, viewmats_grad)
     return (*grads, viewmats if viewmats_grad else None, *[None] * 12)
 
 
-_gradient_ops = ["rasterize_gaussians_backward"]
-register_gradients("rasterize_gaussians", _backward, _setup, gradient_ops=_gradient_ops, without=["Ks"])
+def _folded(size: int, scene: Sequence[Tensor], is_batched: Sequence[bool], options: Sequence) -> tuple[list, list]:
+    """Scenes of a batch one after the other in a single call: its 11 tensors, and options with its sizes."""
+    rows = [x if has else x.expand(size, *x.shape) for x, has in zip(scene, is_batched, strict=True)]
+    means, viewmats, (image_cloud, cu_rows) = rows[0], rows[7], rows[9:]
+    n_clouds, entry = cu_rows.shape[1] - 1, torch.arange(size, device=means.device)[:, None]
+    ends = (cu_rows[:, 1:] + means.shape[1] * entry).flatten()
+    lists = [(image_cloud + n_clouds * entry).flatten(), torch.cat([cu_rows[0, :1], ends])]
+    rows = [x.flatten(0, 1) for x in rows[:9]] + lists
+    width, height = options[:2]
+    return rows, [*options[:5], *sizes_of_state(rows[0], size * viewmats.shape[1], size * n_clouds, width, height)]
+
+
+def _batched(size, inputs, is_batched):
+    rows, options = _folded(size, inputs[:11], is_batched[:11], inputs[11:])
+    *images, state, unusable = call(OP, *rows, *options, inputs[-1])
+    images = [x.unflatten(0, (size, -1)) for x in images]
+    return (*images, state.expand(size, -1), unusable.reshape(size, -1, 2))  # the state is of all of them
+
+
+def _backward_batched(size, inputs, is_batched):
+    of_images = [
+        (x if has else x.expand(size, *x.shape)).flatten(0, 1) for x, has in zip(inputs[:6], is_batched, strict=False)
+    ]
+    state = inputs[6][0] if is_batched[6] else inputs[6]
+    rows, options = _folded(size, inputs[7:18], is_batched[7:18], inputs[18:])
+    grads = call("rasterize_gaussians_backward", *of_images, state, *rows, *options, inputs[-1])
+    return tuple(x.reshape(size, x.shape[0] // size, *x.shape[1:]) for x in grads)
+
+
+TANGENT = "rasterize_gaussians_backward_tangent"  # of images and of gradients, along a direction
+
+
+@fake(TANGENT)
+def _(*inputs):
+    return (*(x.new_empty(x.shape) for x in inputs[19:23]), *(x.new_empty(x.shape) for x in inputs[:8]))
+
+
+def _tangent(scene, tangents, images, options):
+    """What TANGENT says of the 11 tensors of a scene; None: 0."""
+    if scene[0].device.type != "cpu":
+        said = "is once differentiable on a GPU, in reverse mode; use tensors on the CPU"
+        raise GradientError(f"{OP} (order 2): the rasterizer {said}", op=OP, argument=None, order=2)
+    along = [torch.zeros_like(x) if t is None or t.shape != x.shape else t for t, x in zip(tangents, scene)]
+    return call(TANGENT, *scene, *along, *images, *options)
+
+
+def _jvp(inputs, tangents, outputs):
+    if tangents[8] is not None:
+        raise GradientError(f"{OP}: cameras.Ks has no gradient (order 1)", op=OP, argument="Ks", order=1)
+    zeros = [torch.zeros_like(x) for x in outputs[:4]]
+    return (*_tangent(inputs[:11], tangents[:8], zeros, inputs[11:16])[:4], *[None] * 4)
+
+
+def _second_setup(ctx, inputs, output):
+    ctx.set_materialize_grads(False)
+    ctx.save_for_backward(*inputs[:4], *inputs[7:18])
+    ctx.options = inputs[18:23]
+
+
+def _second_backward(ctx, *grads):
+    saved = ctx.saved_tensors
+    tangents = _tangent(saved[4:], grads, saved[:4], ctx.options)
+    return (*tangents[:4], None, None, None, *tangents[4:], *[None] * 12)
+
+
+def _second_jvp(inputs, tangents, outputs):
+    images = [torch.zeros_like(x) if t is None else t for t, x in zip(tangents[:4], inputs[:4])]
+    linear = call("rasterize_gaussians_backward", *images, *inputs[4:])
+    others = _tangent(inputs[7:18], tangents[7:15], inputs[:4], inputs[18:23])[4:]
+    return tuple(a + b if a.shape == b.shape else a for a, b in zip(linear, others, strict=True))
+
+
+def _third(ctx, *_):
+    said = "has no third derivative (order 3); detach the second"
+    raise GradientError(f"{OP}: the rasterizer {said}", op=OP, argument=None, order=3)
+
+
+register_gradients("rasterize_gaussians", _backward, _setup, without=["Ks"], jvp=_jvp, batched=_batched)
+register_gradients(
+    "rasterize_gaussians_backward", _second_backward, _second_setup, jvp=_second_jvp, batched=_backward_batched
+)
+register_gradients(TANGENT, _third, lambda ctx, inputs, output: None, batched=one_by_one(TANGENT))
 register_autocast("rasterize_gaussians", "float32")

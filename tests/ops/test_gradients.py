@@ -96,8 +96,9 @@ CALLS = {
 }
 
 
-# What these have beyond the first order is in test_transforms.py.
+# What these have beyond the first order is in test_transforms.py and test_raster_transforms.py.
 HIGHER = {"pool_max", "pool_mean", "unpool", "sparse_conv", "patch_attention", "attention_log_sum_exp"}
+HIGHER |= {"rasterize_gaussians"}
 FIRST_ORDER = sorted(CALLS.keys() - HIGHER)
 ONCE = [op for op in FIRST_ORDER if op != "add_cells"]  # its gradient is a sum, which has one
 

@@ -46,6 +46,12 @@ struct Jet {
     for (int i = 0; i < kN; ++i) out.along[i] = (a.along[i] - out.value * b.along[i]) * inverse;
     return out;
   }
+  GSIM3D_HD friend Jet operator-(const Jet& a) { return Jet(V(0)) - a; }
+  GSIM3D_HD friend Jet& operator+=(Jet& a, const Jet& b) { return a = a + b; }
+  GSIM3D_HD friend Jet& operator-=(Jet& a, const Jet& b) { return a = a - b; }
+  GSIM3D_HD friend bool operator<(const Jet& a, const Jet& b) { return a.value < b.value; }
+  GSIM3D_HD friend bool operator>(const Jet& a, const Jet& b) { return a.value > b.value; }
+  GSIM3D_HD friend bool operator==(const Jet& a, const Jet& b) { return a.value == b.value; }
   // Of a constant.
   GSIM3D_HD friend Jet operator+(const Jet& a, const V& b) {
     Jet out = a;

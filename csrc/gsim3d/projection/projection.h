@@ -4,11 +4,11 @@
 // from cu_pairs[i] on, in the order of rows. For a mean m in the camera's frame and the lens u(m), with J = du/dm:
 //   mean2d = u(m),  covariance = J W R S S R^T W^T J^T + dilation I,  conic = covariance^-1,  depth = z of m
 //   compensation = sqrt(det(covariance without dilation) / det(covariance))            (Mip-Splatting)
-// A pair that is not seen holds zeros and has no gradient: outside of (near, far), beyond the lens's monotone radius, too
-// faint, too small, outside of the image, or made of numbers that cannot be used. Same bits for any number of threads.
+// A pair that is not seen holds zeros and has no gradient: outside of (near, far), beyond the lens's monotone radius,
+// too faint, too small, outside of the image, or made of numbers that cannot be used. Same bits for any number of threads.
 //
-// Sources: Zwicker et al., EWA splatting (2002); Yu et al., Mip-Splatting (2024); OpenCV's camera models; conventions of
-// gsplat (Apache-2.0).
+// Sources: Zwicker et al., EWA splatting (2002); Yu et al., Mip-Splatting (2024); OpenCV's camera models; conventions
+// of gsplat (Apache-2.0).
 #pragma once
 
 #include <cstdint>
@@ -107,8 +107,8 @@ void sh_backward(const T* grad, const T* directions, const T* sh, T* grad_direct
 
 }  // namespace cpu
 
-// The same functions on device memory; nothing waits for the device. Lists are not checked: an image whose cloud is none
-// shows nothing.
+// The same functions on device memory; nothing waits for the device. Lists are not checked: an image whose cloud is
+// none shows nothing.
 namespace cuda {
 
 

@@ -325,7 +325,8 @@ GSIM3D_HD bool radii_of(const ProjectionScene<T>& s, const Pair<T>& p, T opacity
 }
 
 template <typename T>
-GSIM3D_HD void write_pair(const ProjectionScene<T>& s, const View<T>& view, int64_t row, const ProjectionPairs<T>& out) {
+GSIM3D_HD void write_pair(const ProjectionScene<T>& s, const View<T>& view, int64_t row,
+                          const ProjectionPairs<T>& out) {
   const int64_t pair = view.pair_begin + row - view.row_begin;
   T point[3];
   to_camera(view, s.means + 3 * row, point);
@@ -398,7 +399,7 @@ GSIM3D_HD void write_camera_grad(const ProjectionSceneGrads<T>& grads, int64_t i
     grads.distortion[kDistortion * image + i] = lens[kIntrinsics + i];
 }
 
-// ---- colours of spherical harmonics ----------------------------------------------------------------------------------
+// ---- colours of spherical harmonics --------------------------------------------------------------------------------
 
 template <typename T>
 GSIM3D_HD T unit_of(const T direction[3], T unit[3]) {

@@ -52,8 +52,8 @@ struct RasterScene {
   T near_plane;  // metres; Gaussians whose centre is not beyond it are left out
   RasterCutoff cutoff;
   RasterJacobian jacobian = RasterJacobian::kExact;
-  // Of projected rows, in place of means, quats, scales, viewmats and Ks. A row whose conic is not positive definite, or
-  // whose depth is not positive, is left out.
+  // Of projected rows, in place of means, quats, scales, viewmats and Ks. A row whose conic is not positive definite,
+  // or whose depth is not positive, is left out.
   const T* means2d = nullptr;  // [n_rows, 2] pixels
   const T* conics = nullptr;   // [n_rows, 3] xx, xy, yy of the inverse covariance, px^-2
   const T* depths = nullptr;   // [n_rows] metres
@@ -126,6 +126,19 @@ struct RasterSceneGrads {
   int64_t feature_columns(int64_t n_features) const { return n_features + (absolute ? 2 : 0); }
 };
 
+// A direction of the arguments of the same names; null: 0.
+template <typename T>
+struct RasterTangents {
+  const T* means;
+  const T* quats;
+  const T* scales;
+  const T* opacities;
+  const T* color;
+  const T* features;
+  const T* background;
+  const T* viewmats;
+};
+
 namespace cpu {
 
 // Throws ArgumentError for cameras and offsets that cannot be rendered. Rows that cannot are left out and counted.
@@ -138,6 +151,13 @@ void raster_forward(const RasterScene<T>& scene, const RasterImages<T>& images, 
 template <typename T>
 void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& image_grads,
                      const RasterSceneGrads<T>& grads, const Workspace& workspace, const Parallel& parallel);
+
+// Derivatives along `tangents`: of the images (color, alpha, depth and features are written) and of every gradient that
+// raster_backward gives for `image_grads` (of which transmittance and last are not read).
+template <typename T>
+void raster_tangent(const RasterScene<T>& scene, const RasterTangents<T>& tangents,
+                    const RasterImageGrads<T>& image_grads, const RasterImages<T>& images,
+                    const RasterSceneGrads<T>& grads, const Workspace& workspace, const Parallel& parallel);
 
 }  // namespace cpu
 

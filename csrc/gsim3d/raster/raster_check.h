@@ -16,7 +16,8 @@ void check_options(const RasterScene<T>& s) {
   constexpr const char* kOp = "rasterize_gaussians";
   check(s.width >= 1 && s.height >= 1 && s.width <= kMaxPixels && s.height <= kMaxPixels, kOp,
         ": width and height must be in [1, ", kMaxPixels, "]; got ", s.width, " and ", s.height);
-  check(s.sh_terms == kProjected || s.sh_terms == 0 || s.sh_terms == 1 || s.sh_terms == 4 || s.sh_terms == 9 || s.sh_terms == 16, kOp,
+  const int64_t terms = s.sh_terms;
+  check(terms == kProjected || terms == 0 || terms == 1 || terms == 4 || terms == 9 || terms == 16, kOp,
         ": sh must have 1, 4, 9 or 16 coefficients (degree 0 to 3); got ", s.sh_terms);
   check(std::isfinite(s.near_plane) && s.near_plane > 0, kOp, ": near_plane must be positive; got ", s.near_plane);
   const auto cutoff = static_cast<int64_t>(s.cutoff);

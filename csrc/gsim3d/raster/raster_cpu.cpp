@@ -5,12 +5,10 @@
 #include "gsim3d/raster/raster_check.h"
 #include "gsim3d/raster/raster_tiles.h"
 
-namespace gsim3d::cpu {
-namespace {
-
-using namespace raster;  // NOLINT: this file is its other half
+namespace gsim3d::raster {
 
 constexpr const char* kOp = "rasterize_gaussians";
+
 template <typename T>
 void check_scene(const RasterScene<T>& s) {
   check_options(s);
@@ -40,6 +38,39 @@ void check_scene(const RasterScene<T>& s) {
           ": Ks must be [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]; got another pattern for image ", i);
   }
 }
+
+template <typename T>
+void clear_grads(const RasterScene<T>& scene, const RasterSceneGrads<T>& grads) {
+  const int64_t n = scene.n_rows, n_columns = grads.feature_columns(scene.n_features);
+  if (scene.sh_terms == kProjected) {
+    std::fill_n(grads.means2d, n * 2, T(0));
+    std::fill_n(grads.conics, n * 3, T(0));
+    std::fill_n(grads.depths, n, T(0));
+  } else {
+    std::fill_n(grads.means, n * 3, T(0));
+    std::fill_n(grads.quats, n * 4, T(0));
+    std::fill_n(grads.scales, n * 3, T(0));
+  }
+  std::fill_n(grads.opacities, n, T(0));
+  std::fill_n(grads.color, n * std::max<int64_t>(1, scene.sh_terms) * 3, T(0));
+  std::fill_n(grads.features, n * n_columns, T(0));
+  std::fill_n(grads.background, scene.n_images * 3, T(0));
+  if (grads.viewmats) std::fill_n(grads.viewmats, scene.n_images * 16, T(0));
+}
+
+#define GSIM3D_INSTANTIATE(T)                     \
+  template void check_scene(const RasterScene<T>&); \
+  template void clear_grads(const RasterScene<T>&, const RasterSceneGrads<T>&);
+GSIM3D_INSTANTIATE(float)
+GSIM3D_INSTANTIATE(double)
+#undef GSIM3D_INSTANTIATE
+
+}  // namespace gsim3d::raster
+
+namespace gsim3d::cpu {
+namespace {
+
+using namespace raster;  // NOLINT: this file is its other half
 
 // Adds lanes [0, n) of `value` to column `column` of the listed rows.
 template <typename T>
@@ -184,22 +215,8 @@ template <typename T>
 void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& image_grads,
                      const RasterSceneGrads<T>& grads, const Workspace& workspace, const Parallel& parallel) {
   check_scene(scene);
-  const int64_t n = scene.n_rows, n_columns = grads.feature_columns(scene.n_features);
-  if (scene.sh_terms == kProjected) {
-    std::fill_n(grads.means2d, n * 2, T(0));
-    std::fill_n(grads.conics, n * 3, T(0));
-    std::fill_n(grads.depths, n, T(0));
-  } else {
-    std::fill_n(grads.means, n * 3, T(0));
-    std::fill_n(grads.quats, n * 4, T(0));
-    std::fill_n(grads.scales, n * 3, T(0));
-  }
-  std::fill_n(grads.opacities, n, T(0));
-  std::fill_n(grads.color, n * std::max<int64_t>(1, scene.sh_terms) * 3, T(0));
-  std::fill_n(grads.features, n * n_columns, T(0));
-  std::fill_n(grads.background, scene.n_images * 3, T(0));
-  if (grads.viewmats) std::fill_n(grads.viewmats, scene.n_images * 16, T(0));
-
+  clear_grads(scene, grads);
+  const int64_t n_columns = grads.feature_columns(scene.n_features);
   Scratch scratch(workspace);
   Group<T> group;
   while (next_group(scene, true, scratch, parallel, group)) {

@@ -203,7 +203,8 @@ __device__ void gather_rows(const Job<T>& job, const Slots<T>& slots, const Rast
       fetch();
       SlotSums<T> sums;
       T viewmat[12] = {};
-      if (!sum_slots(job, group, row, bounds, slot_begin, slots, sums, grads.features + row * slots.n_columns)) continue;
+      T* const features = grads.features + row * slots.n_columns;
+      if (!sum_slots(job, group, row, bounds, slot_begin, slots, sums, features)) continue;
       if (group.finished)
         project_vjp_of<T, kTerms>(view.camera, gaussian, colors.mine(), sums, grad, grad_color, viewmat), shown = true;
       else

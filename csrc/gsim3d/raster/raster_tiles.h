@@ -126,6 +126,12 @@ Simd<T> gather(const T* matrix, const int64_t* rows, int64_t width, int64_t colu
   return load<Simd<T>>(lanes);
 }
 
+// Throws ArgumentError for what cannot be rendered; writes zeros to all gradients.
+template <typename T>
+void check_scene(const RasterScene<T>& scene);
+template <typename T>
+void clear_grads(const RasterScene<T>& scene, const RasterSceneGrads<T>& grads);
+
 // Next group of images after group.last: splats, lists, and with `backward` the way back from pairs to instances.
 // False when no image is left.
 template <typename T>

@@ -154,6 +154,16 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "max_slots, bool viewmats_grad) -> (Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor color, "
       "Tensor features, Tensor background, Tensor viewmats)");
 
+  // Derivatives along the tangents t_*, on the CPU: of the four images, and of all gradients that those of images give.
+  m.def(
+      "rasterize_gaussians_backward_tangent(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor color, "
+      "Tensor features, Tensor background, Tensor viewmats, Tensor Ks, Tensor image_cloud, Tensor cu_rows, Tensor "
+      "t_means, Tensor t_quats, Tensor t_scales, Tensor t_opacities, Tensor t_color, Tensor t_features, Tensor "
+      "t_background, Tensor t_viewmats, Tensor grad_color, Tensor grad_alpha, Tensor grad_depth, Tensor grad_features, "
+      "int width, int height, float near_plane, int cutoff, int jacobian) -> (Tensor color, Tensor alpha, Tensor depth, "
+      "Tensor features, Tensor grad_means, Tensor grad_quats, Tensor grad_scales, Tensor grad_opacities, Tensor "
+      "grad_in_color, Tensor grad_in_features, Tensor grad_background, Tensor grad_viewmats)");
+
   // The same blending of Gaussians that are projected already, each for one image. The gradient of `absolute` [P, 2] is
   // the sum over pixels of |gradient of means2d|; it takes no other part, and is two more columns of features.
   m.def(
