@@ -224,6 +224,56 @@ def _raster(device: str) -> float:
     return _compare(device, function, reference, means, scales, opacities, colors)
 
 
+def _projection(device: str) -> float:
+    n, focal, half = 5, 16.0, 8.0
+    K = torch.tensor([[[focal, 0, half], [0, focal, half], [0, 0, 1]]])
+    one, first = torch.ones(1), torch.zeros(1, dtype=torch.int64)
+    cameras = Cameras(torch.eye(4)[None], K, one, one, first, 16, 16).to(device)
+
+    def reference(means: Tensor, scales: Tensor, sh: Tensor) -> Tensor:
+        x, y, z = means.unbind(1)
+        zero = torch.zeros(n)
+        slopes = torch.stack([focal / z, zero, -focal * x / z**2, zero, focal / z, -focal * y / z**2], 1)
+        J = slopes.reshape(n, 2, 3)
+        conics = torch.linalg.inv(J @ torch.diag_embed(scales**2) @ J.mT + 0.3 * torch.eye(2)).reshape(n, 4)
+        x, y, z = torch.nn.functional.normalize(means, dim=1).unbind(1)
+        basis = torch.stack([0.28209479 + 0 * x, -0.48860251 * y, 0.48860251 * z, -0.48860251 * x], 1)
+        colors = (0.5 + torch.einsum("nk,nkc->nc", basis, sh)).clamp_min(0)
+        return torch.cat([focal * means[:, :2] / means[:, 2:] + half, conics[:, [0, 1, 3]], means[:, 2:], colors], 1)
+
+    def function(means: Tensor, scales: Tensor, sh: Tensor) -> Tensor:
+        quats = torch.tensor([[1.0, 0, 0, 0]], device=means.device).expand(n, 4)
+        pairs = ops.project_gaussians(means, quats, scales, cameras)
+        colors = ops.sh_to_color(means, sh)
+        return torch.cat([pairs.means2d, pairs.conics, pairs.depths[:, None], colors], 1)
+
+    means = 0.2 * _random(n, 3) + torch.tensor([0.0, 0.0, 2.0])
+    return _compare(device, function, reference, means, 0.1 + 0.1 * _random(n, 3).abs(), 0.2 * _random(n, 4, 3, seed=1))
+
+
+def _raster_projected(device: str) -> float:
+    size, depths = 12, torch.linspace(1, 2, 4)
+    pixel = torch.arange(size) + 0.5
+
+    def reference(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor) -> Tensor:
+        image, transmittance = torch.zeros(size, size, 4), torch.ones(size, size)
+        for mean, (a, b, c), opacity, color in zip(means2d, conics, opacities, colors):
+            dx, dy = (torch.stack(torch.meshgrid(pixel, pixel, indexing="xy"), -1) - mean).unbind(-1)
+            alpha = opacity * torch.exp(-(a * dx * dx + 2 * b * dx * dy + c * dy * dy) / 2)
+            alpha = torch.where(alpha >= 1 / 255, alpha, 0.0)
+            image = image + (transmittance * alpha)[..., None] * color
+            transmittance = transmittance * (1 - alpha)
+        return image[None]
+
+    def function(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor) -> Tensor:
+        rows = (means2d, conics, depths.to(means2d.device), opacities, colors)
+        return ops.rasterize_projected(*rows, width=size, height=size).color
+
+    conics = torch.tensor([[0.2, 0.05, 0.3], [0.1, -0.05, 0.1], [0.5, 0.0, 0.2], [0.3, 0.1, 0.3]])
+    means2d, colors = size * (0.5 + 0.2 * _random(4, 2)), _random(4, 4, seed=1)
+    return _compare(device, function, reference, means2d, conics, torch.tensor([0.3, 0.5, 0.7, 0.4]), colors)
+
+
 def _decode(device: str) -> float:
     def reference(raw: Tensor) -> Tensor:
         quats = torch.nn.functional.normalize(raw[:, 3:7].roll(1, 1), dim=1)
@@ -292,4 +342,6 @@ CHECKS: dict[str, Callable[[str], float]] = {
     "background": _background,
     "validate_state": _validate_state,
     "raster": _raster,
+    "projection": _projection,
+    "raster_projected": _raster_projected,
 }

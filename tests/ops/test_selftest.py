@@ -10,8 +10,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from gsim3d import ops
 from gsim3d.ops import selftest
 
-# What a fused network calls itself (tests/nn/test_fused_block.py), and a GPU alone needs.
-NOT_ALONE = {"patch_attention_backward_packed", "sparse_conv_plan"}
+# What a fused network calls itself (tests/nn/test_fused_block.py), a GPU alone needs, and a CPU alone has.
+NOT_ALONE = {"patch_attention_backward_packed", "sparse_conv_plan", "rasterize_gaussians_backward_tangent"}
 CORE = Path(__file__).parents[2] / "csrc" / "gsim3d"
 
 

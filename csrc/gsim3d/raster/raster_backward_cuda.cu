@@ -30,7 +30,8 @@ template <typename T>
 __device__ void gather_any(const Job<T>& job, const Slots<T>& slots, const RasterSceneGrads<T>& grads) {
   const auto gather = [&](auto terms) {
     constexpr int kTerms = decltype(terms)::value;
-    if (slots.viewmats) gather_viewmats<T, kTerms>(job, slots);
+    if constexpr (kTerms != kProjected)
+      if (slots.viewmats) gather_viewmats<T, kTerms>(job, slots);
     cooperative_groups::this_grid().sync();
     gather_rows<T, kTerms>(job, slots, grads, dynamic_memory);
   };
@@ -117,9 +118,10 @@ void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& ima
   });
   dispatch_sh(scene.sh_terms, [&](auto terms) {
     constexpr int kTerms = decltype(terms)::value;
-    if (viewmats)
-      launch(kRaster, gather_viewmats_kernel<T, kTerms>, grid_for(scene.n_images * kViewmatParts, 1), kBlock, 0, stream,
-             job, slots);
+    if constexpr (kTerms != kProjected)
+      if (viewmats)
+        launch(kRaster, gather_viewmats_kernel<T, kTerms>, grid_for(scene.n_images * kViewmatParts, 1), kBlock, 0,
+               stream, job, slots);
     launch(kRaster, gather_rows_kernel<T, kTerms>, grid_of_chunks(scene), kBlock, 2 * kRowBytes<T, kTerms>, stream,
            job, slots, grads);
   });

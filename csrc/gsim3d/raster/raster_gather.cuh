@@ -253,9 +253,8 @@ __device__ void gather_viewmats(const Job<T>& job, const Slots<T>& slots) {
       SlotSums<T> sums;
       if (!sum_slots<T>(job, group, row, bounds, slot_begin, slots, sums, nullptr)) continue;
       RowGrad<T> unused{};
-      if constexpr (kTerms != kProjected)
-        project_vjp_of<T, kTerms>(view.camera, Gaussian<T>(s, row), s.color + row * kColumns, sums, unused,
-                                  static_cast<T*>(nullptr), viewmat);
+      project_vjp_of<T, kTerms>(view.camera, Gaussian<T>(s, row), s.color + row * kColumns, sums, unused,
+                                static_cast<T*>(nullptr), viewmat);
     }
     reduce_block(viewmat, shared);
     if (threadIdx.x == 0)

@@ -136,12 +136,18 @@ __device__ void count_tiles(const Job<T>& job, uint32_t* counts, const PixelRect
   }
 }
 
+// One array for all numbers of SH terms.
+__device__ inline Walked<Nothing>* walked_memory() {
+  __shared__ Walked<Nothing> walked[kBlock];
+  return walked;
+}
+
 // `memory`: SharedRows of the colours.
 template <typename T, int kTerms>
 __device__ void project_rows(const Job<T>& job, unsigned char* memory) {
   const RasterScene<T>& s = job.scene;
   constexpr int kColumns = kColorColumns<kTerms>;
-  __shared__ Walked<Nothing> walked[kBlock];
+  Walked<Nothing>* const walked = walked_memory();
   const SharedRows<T, kColumns> colors(memory);
   const int64_t last = job.group->last, n_chunks = count_chunks(job);
   const int lane = threadIdx.x % kWarp;
