@@ -69,8 +69,8 @@ def _checked(path: Path, frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
 
 def _write_h264(av, part: Path, first: np.ndarray, rest: Iterable[np.ndarray], fps: float) -> None:
     rate = Fraction(fps).limit_denominator(FINEST)
-    with av.open(str(part), "w", format="mp4", options={"movflags": "faststart"}) as container:
-        stream = container.add_stream(H264, rate=rate, options={"crf": QUALITY})
+    with av.open(opencv_path(part), "w", format="mp4", options={"movflags": "faststart"}) as container:
+        stream = container.add_stream(H264, rate=rate, options={"crf": QUALITY, "bf": "0"})  # frames in their order
         stream.height, stream.width, stream.pix_fmt = *first.shape[:2], "yuv420p"
         stream.color_primaries = stream.color_trc = stream.colorspace = BT709
         for image in chain([first], rest):
