@@ -36,7 +36,7 @@ _LOGITS = "Logits/Conv3d_0c_1x1"
 class _ArrayUnpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str):
         if (module, name) not in ALLOWED:
-            raise InputError(f"the pickle references {module}.{name}; only numpy arrays are allowed in weights")
+            raise InputError(f"the pickle references {module}.{name}: only numpy arrays are allowed in weights")
         return ALLOWED[module, name]
 
 
