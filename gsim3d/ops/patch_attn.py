@@ -27,7 +27,7 @@ def patch_attention(
 
     Args:
         q: queries [Nq, H, D], floating point (softmax and sums of 16-bit ones are float32); D a multiple of 4 from 4 to
-            128, fastest 16, 32 and 64. Under ``torch.autocast`` CUDA computes in its dtype and the CPU in float32.
+            256, fastest 16, 32 and 64. Under ``torch.autocast`` CUDA computes in its dtype and the CPU in float32.
         k, v: keys and values [Nk, H, D]. The three may be views of one qkv tensor; they are read in place. Or
             [Nk, H / G, D]: head h of the queries reads head h // G.
         table: patches, int64 or int32; a row at most once in ``q_rows``, any number of times in ``kv_rows``. What the

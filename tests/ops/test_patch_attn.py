@@ -25,7 +25,7 @@ from tests.oracle import patch_attn as oracle
 DTYPES = {torch.float32: "float32", torch.float64: "float64"}
 # (queries, keys) of patches: around one and two tiles of 64, one row, no keys, no queries.
 RAGGED = ((3, 1), (70, 130), (0, 4), (5, 0), (64, 64), (1, 65), (2, 63))
-DIMS = (4, 8, 12, 16, 20, 32, 48, 64, 96, 128)
+DIMS = (4, 8, 12, 16, 20, 32, 48, 64, 96, 128, 200, 256)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -207,7 +207,7 @@ def test_gradcheck(scale):
 
 
 @pytest.mark.parametrize("dtype", DTYPES, ids=DTYPES.values())
-@pytest.mark.parametrize("dim", [16, 20, 64])
+@pytest.mark.parametrize("dim", [16, 20, 64, 256])
 def test_devices_agree(devices, dim, dtype):
     case = random_case(dim=dim, dtype=dtype)
     cpu, cuda = (gradients(case.to(d).attend, case.to(d).inputs, cotangent_of(case)) for d in devices)
@@ -448,9 +448,9 @@ WRONG = {
     "v must be": dict(v=torch.zeros(2, 1, 8)),
     "k must be float32": dict(k=torch.zeros(3, 1, 8, dtype=torch.float64)),
     "q must be float32 or float64": {name: torch.zeros(3, 1, 8, dtype=torch.int32) for name in "qkv"},
-    "head dim must be a multiple of 4 from 4 to 128; got 6": {name: torch.zeros(3, 1, 6) for name in "qkv"},
-    "head dim must be a multiple of 4 from 4 to 128; got 132": {name: torch.zeros(3, 1, 132) for name in "qkv"},
-    "head dim must be a multiple of 4 from 4 to 128; got 0": {name: torch.zeros(3, 1, 0) for name in "qkv"},
+    "head dim must be a multiple of 4 from 4 to 256; got 6": {name: torch.zeros(3, 1, 6) for name in "qkv"},
+    "head dim must be a multiple of 4 from 4 to 256; got 260": {name: torch.zeros(3, 1, 260) for name in "qkv"},
+    "head dim must be a multiple of 4 from 4 to 256; got 0": {name: torch.zeros(3, 1, 0) for name in "qkv"},
     "q_rows must be int64": dict(q_rows=torch.zeros(3, dtype=torch.int16)),
     "kv_rows must have one dimension": dict(kv_rows=torch.zeros(3, 1, dtype=torch.int64)),
     "q_rows must be in [0, N) with N=3 from q; got 3 at 2": dict(q_rows=rows(0, 1, 3)),

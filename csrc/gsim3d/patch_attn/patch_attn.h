@@ -42,13 +42,13 @@ struct HeadRows {
 
 struct AttentionSize {
   int64_t heads;  // H
-  int64_t dim;    // D, a multiple of 4 from 4 to 128
+  int64_t dim;    // D, a multiple of 4 from 4 to 256
   double scale;   // finite
 };
 
 namespace cpu {
 
-constexpr int64_t kMaxHeadDim = 128;
+constexpr int64_t kMaxHeadDim = 256;
 
 // Throw ArgumentError unless the table or the size is well formed. `op` starts the message.
 void check_patch_table(const char* op, const PatchTable& table);

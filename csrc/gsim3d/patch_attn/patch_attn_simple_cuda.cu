@@ -397,7 +397,8 @@ void with_lanes(int64_t dim, const F& f) {
   if (dim <= kDims) f.template operator()<1>();
   else if (dim <= 2 * kDims) f.template operator()<2>();
   else if (dim <= 4 * kDims) f.template operator()<4>();
-  else f.template operator()<8>();
+  else if (dim <= 8 * kDims) f.template operator()<8>();
+  else f.template operator()<16>();
 }
 
 }  // namespace
