@@ -408,6 +408,38 @@ def _call_raster(a: Arguments):
     return tuple(ops.rasterize_gaussians(*first, cameras, **options))
 
 
+def _projection(rng: random.Random) -> Arguments:
+    taken = ("means", "quats", "scales", "opacities", *CAMERA, "cu_rows")
+    return {name: value for name, value in _raster(rng).items() if name in taken}
+
+
+def _call_projection(a: Arguments):
+    cameras = Cameras(**{name: a[name] for name in CAMERA})
+    rows = [a[name] for name in ("means", "quats", "scales")]
+    pairs = ops.project_gaussians(*rows, cameras, opacities=a["opacities"], cu_rows=a["cu_rows"])
+    return pairs.means2d, pairs.depths
+
+
+def _projected(rng: random.Random) -> Arguments:
+    n, dtype = _size(rng), _dtype(rng)
+    return {
+        "means2d": tensor(rng, n, 2, dtype=dtype, scale=8),
+        "conics": tensor(rng, n, 3, dtype=dtype).abs(),
+        "depths": tensor(rng, n, dtype=dtype).abs() + 0.1,
+        "opacities": tensor(rng, n, dtype=dtype).sigmoid(),
+        "colors": tensor(rng, n, rng.choice((0, 1, 3, 5)), dtype=dtype),
+        "width": rng.choice((1, 10, 17)),
+        "height": rng.choice((1, 8)),
+        "cu_pairs": _offsets(rng, n, rng.choice((1, 2))),
+    }
+
+
+def _harmonics(rng: random.Random) -> Arguments:
+    n, dtype = _size(rng), _dtype(rng)
+    terms = rng.choice((1, 4, 9, 16, 25))
+    return {"directions": tensor(rng, n, 3, dtype=dtype), "sh": tensor(rng, n, terms, 3, dtype=dtype)}
+
+
 # op -> (good arguments, the call)
 OPS: dict[str, tuple[Callable[[random.Random], Arguments], Callable[[Arguments], Any]]] = {
     "curve_encode": (_curve_encode, lambda a: ops.curve_encode(**a)),
@@ -435,6 +467,9 @@ OPS: dict[str, tuple[Callable[[random.Random], Arguments], Callable[[Arguments],
     "plane_sweep": (_plane_sweep, lambda a: ops.plane_sweep(**a)),
     "sweep_geometry": (_sweep_geometry, lambda a: ops.sweep_geometry(**a)),
     "rasterize_gaussians": (_raster, _call_raster),
+    "project_gaussians": (_projection, _call_projection),
+    "rasterize_projected": (_projected, lambda a: tuple(ops.rasterize_projected(**a)[:3])),
+    "sh_to_color": (_harmonics, lambda a: ops.sh_to_color(**a)),
 }
 
 
