@@ -260,7 +260,7 @@ def test_errors_name_the_argument():
         rasterize_projected(*first, colors, cutoff="tile3sigma", **size)
     with pytest.raises(ValueError, match="width and height"):
         rasterize_projected(*first, colors, width=0, height=4, cu_pairs=cu_pairs)
-    with pytest.raises(ValueError, match="cu_rows must run from 0"):
+    with pytest.raises(ValueError, match="cu_pairs must run from 0"):
         rasterize_projected(*first, colors, width=4, height=4, cu_pairs=torch.tensor([0, 10]))
     with pytest.raises(NumericalError, match="means2d must be finite"):
         rasterize_projected(first[0] / 0, *first[1:], colors, **size)
