@@ -101,9 +101,9 @@ def _check(rows: dict[str, Tensor], optional: dict[str, Tensor], width: int, hei
         raise ValueError(f"{OP}: colors must be [P={n}, D] of floats; got {colors.dtype} {list(colors.shape)}")
     if cu_pairs is not None and (cu_pairs.dim() != 1 or cu_pairs.shape[0] < 1 or cu_pairs.dtype != torch.int64):
         raise ValueError(f"{OP}: cu_pairs must be int64 [I + 1]; got {cu_pairs.dtype} {list(cu_pairs.shape)}")
-    if cu_pairs is not None and cu_pairs.device.type == "cpu" and not torch.compiler.is_compiling():
-        if cu_pairs[0] != 0 or cu_pairs[-1] != n or bool((cu_pairs.diff() < 0).any()):
-            raise ValueError(f"{OP}: cu_pairs must run from 0 to P={n} without descending; got {cu_pairs.tolist()}")
+    readable = cu_pairs is not None and cu_pairs.device.type == "cpu" and not torch.compiler.is_compiling()
+    if readable and (cu_pairs[0] != 0 or cu_pairs[-1] != n or bool((cu_pairs.diff() < 0).any())):
+        raise ValueError(f"{OP}: cu_pairs must run from 0 to P={n} without descending; got {cu_pairs.tolist()}")
     n_images = 1 if cu_pairs is None else cu_pairs.shape[0] - 1
     if background is not None and background.shape not in ((colors.shape[1],), (n_images, colors.shape[1])):
         raise ValueError(
