@@ -123,7 +123,7 @@ def test_restore_without_weights_of_off_effects(tmp_path):
         assert_same_bits(restored.simulator.state_dict()[name], value, name)
     restored.simulator.absent = frozenset({"dynamics.net.encoder.1.merge.time_embedding"})
     with pytest.raises(
-        UnsupportedEffect, match="they read dynamics.net.encoder.1.merge.time_embedding, which the weights"
+        UnsupportedEffect, match="they require dynamics.net.encoder.1.merge.time_embedding, which the weights"
     ):
         restored.simulator.plan()
     needed = {name: value for name, value in weights.items() if "encoder.1.merge" not in name}
