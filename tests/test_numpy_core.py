@@ -96,7 +96,7 @@ def test_rasterize_gaussians(dtype):
 def test_constants_say_what_the_kernels_do():
     assert _core.constants["raster_max_alpha"] == 0.99
     with pytest.raises(ValueError, match=str(_core.constants["patch_attn_max_head_dim"])):
-        ops.patch_attention(*[torch.zeros(1, 1, 132)] * 3, ops.PatchTable(*[torch.zeros(1, dtype=torch.int64)] * 4))
+        ops.patch_attention(*[torch.zeros(1, 1, 260)] * 3, ops.PatchTable(*[torch.zeros(1, dtype=torch.int64)] * 4))
 
 
 @pytest.mark.parametrize(

@@ -72,7 +72,8 @@ def widened(x: Tensor) -> Tensor:
 
 def as_given(out: Tensor, x: Tensor) -> Tensor:
     """``out`` in the dtype of ``x``; under autocast as it is."""
-    return out if torch.is_autocast_enabled(x.device.type) else out.to(x.dtype)
+    casts = x.device.type != "meta" and torch.is_autocast_enabled(x.device.type)
+    return out if casts else out.to(x.dtype)
 
 
 def widened_on_cpu(x: Tensor, *others: Tensor | None) -> tuple[Tensor | None, ...]:

@@ -187,7 +187,7 @@ def sh_to_color(directions: Tensor, sh: Tensor) -> Tensor:
         [..., N, D], leading sizes and dtype of ``directions``: views of one row share its coefficients, which are not
         copied.
     Gradients:
-        directions and sh, once; none where a colour was clamped at 0.
+        directions and sh, once; none where a colour was clamped at 0, and none to directions shorter than 1e-18.
     Determinism:
         equal bits for any number of threads.
     Raises:
@@ -233,6 +233,10 @@ def _check(tensors: dict, cameras: Cameras, cu_rows: Tensor | None, lens: str, j
     for name, indices in (("cameras.image_cloud", cameras.image_cloud), ("cu_rows", cu_rows)):
         if indices is not None and (indices.dtype != torch.int64 or indices.dim() != 1):
             raise ValueError(f"{OP}: {name} must be int64 and a list; got {indices.dtype} {list(indices.shape)}")
+    if cu_rows is not None and cu_rows.device.type == "cpu" and not torch.compiler.is_compiling():
+        n, ends = len(tensors["means"]), cu_rows[[0, -1]].tolist() if len(cu_rows) else []
+        if ends != [0, n] or bool((cu_rows.diff() < 0).any()):
+            raise ValueError(f"{OP}: cu_rows must ascend from 0 to N={n}; got {' .. '.join(map(str, ends)) or 'none'}")
     distortion, n_images = tensors.get("distortion"), len(cameras)
     if distortion is not None:
         sizes = N_DISTORTION.get(lens, ())

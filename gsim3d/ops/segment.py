@@ -86,9 +86,9 @@ def segment_softmax(x: Tensor, cu_rows: Tensor, *, check: bool = True) -> Tensor
     n_rows = x.shape[0]
     # The largest score changes no result, so that it needs no gradient.
     largest = call("pool_max", wide.detach(), rows, cu_rows)[0]
-    weights = (wide - call("unpool", largest, rows, cu_rows, n_rows)).exp()
     listed = call("unpool", torch.ones_like(largest), rows, cu_rows, n_rows) > 0
-    weights = torch.where(listed, weights, 0)
+    below = torch.where(listed, wide - call("unpool", largest, rows, cu_rows, n_rows), 0)
+    weights = torch.where(listed, below.exp(), 0)
     totals = call("unpool_backward", weights, rows, cu_rows)
     return as_given(weights / torch.where(listed, call("unpool", totals, rows, cu_rows, n_rows), 1), x)
 

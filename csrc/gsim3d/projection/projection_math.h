@@ -401,12 +401,17 @@ GSIM3D_HD void write_camera_grad(const ProjectionSceneGrads<T>& grads, int64_t i
 
 // ---- colours of spherical harmonics --------------------------------------------------------------------------------
 
+// A direction whose components are all smaller is none: it has a fixed unit vector, and no gradient, which would be
+// too large for float32.
+constexpr double kShortestDirection = 1e-18;
+
 template <typename T>
 GSIM3D_HD T unit_of(const T direction[3], T unit[3]) {
   T largest = 0;
   for (int i = 0; i < 3; ++i) largest = raster::max_of(largest, raster::abs_of(direction[i]));
-  const T inverse_largest = largest > 0 ? T(1) / largest : T(0);
-  for (int i = 0; i < 3; ++i) unit[i] = largest > 0 ? direction[i] * inverse_largest : T(1);
+  const bool is_none = largest < T(kShortestDirection);
+  const T inverse_largest = is_none ? T(0) : T(1) / largest;
+  for (int i = 0; i < 3; ++i) unit[i] = is_none ? T(1) : direction[i] * inverse_largest;
   const T inverse = T(1) / std::sqrt(unit[0] * unit[0] + unit[1] * unit[1] + unit[2] * unit[2]);
   for (int i = 0; i < 3; ++i) unit[i] *= inverse;
   return inverse * inverse_largest;  // 1 / length, 0 where the direction is none
