@@ -330,7 +330,7 @@ def colored_noise(shape: tuple[int, ...], color: float, generator: torch.Generat
         Timmer and Koenig, "On generating power law noise", Astronomy and Astrophysics 300, 1995.
     """
     white = torch.randn(shape, dtype=torch.float64, generator=generator)
-    if color == 0 or shape[-1] == 1:
+    if color == 0 or shape[-1] == 1 or not white.numel():  # the transform takes no empty batch
         return white
     n = shape[-1]
     frequencies = torch.fft.rfftfreq(n, dtype=torch.float64)

@@ -74,6 +74,16 @@ def test_plans_do_not_depend_on_chunks_and_are_functions_of_the_seed(kind):
     assert torch.equal(agent.plan(START).actions, first.actions)
 
 
+@pytest.mark.parametrize("executed", [0, 1, 4])
+def test_a_plan_begins_with_the_last_one_without_executed_actions(executed):
+    agent = planner("mppi")
+    last = agent.plan(START).actions
+    agent.samples = agent.iterations = 1  # nothing but the sequence that it begins with
+    begun = agent.plan(START, executed).actions
+    assert torch.equal(begun[: HORIZON - executed], last[executed:])
+    assert (begun[HORIZON - executed :] == last[-1]).all()
+
+
 @pytest.mark.parametrize("kind", PLANNERS)
 def test_lowest_cost_never_rises_and_actions_stay_inside_bounds(kind):
     # The cost pulls beyond the upper bound.
