@@ -52,6 +52,7 @@ def near_zero(recording: Recording) -> Recording:
     viewmats = recording.viewmats.copy()
     viewmats[..., :3, 3] += viewmats[..., :3, :3] @ offset
     points = {name: value - offset for name in ("origin", "bounds") if (value := getattr(recording, name)) is not None}
+    points["actions"] = recording.changed_actions(lambda positions: positions - offset)
     return dataclasses.replace(recording, viewmats=viewmats, world_offset=recording.world_offset + offset, **points)
 
 

@@ -50,7 +50,7 @@ def check_scene(folder: str | Path) -> SceneCheck:
     path, problems = Path(folder), Problems(collect=True)
     recording = scene = None
     try:
-        recording = layouts.layout_of(path).read(path, problems)
+        recording = layouts.read(path, problems)
         if not problems.found:
             check_directions(recording, problems)
         scene = Scene(path, recording)
@@ -149,11 +149,13 @@ def describe(scene: Scene) -> str:
     labels = "subtracted" if scene.recording.subtract_background else "yes" if scene.has_segmentation() else "none"
     offset = ", ".join(f"{x:.0f}" for x in scene.world_offset) if scene.world_offset.any() else None
     where = "" if offset is None else f", world offset ({offset})"
+    actions = scene.recording.actions
+    actors = "" if actions is None else f", actors: {', '.join(dict.fromkeys(actions.types))}"
     return (
         f"{scene.name}: {scene.layout}, {scene.n_steps} steps at {scene.fps:g} fps, "
         f"{scene.n_cams} cameras{moves}, "
         f"{pixels} pixels, depth {scene.near:.2f} to {scene.far:.2f} m, bounds {size} m{where}, "
-        f"masks: {labels}" + "".join(f"; {note}" for note in scene.recording.notes)
+        f"masks: {labels}{actors}" + "".join(f"; {note}" for note in scene.recording.notes)
     )
 
 

@@ -49,6 +49,7 @@ def resample(recording: Recording, fps: float) -> Recording:
         Ks=Ks,
         read_images=strided(recording.read_images),
         read_labels=None if recording.read_labels is None else strided(recording.read_labels),
+        actions=recording.changed_actions(lambda positions: positions[::stride]),
     )
 
 
@@ -111,7 +112,8 @@ def _in_units_of_cameras(recording: Recording) -> Recording:
         for name in ("near", "far", "origin", "bounds", "world_offset")
         if (value := getattr(recording, name)) is not None
     }
-    return dataclasses.replace(recording, viewmats=viewmats, **lengths)
+    actions = recording.changed_actions(lambda positions: positions / extent)
+    return dataclasses.replace(recording, viewmats=viewmats, actions=actions, **lengths)
 
 
 def _of_size(recording: Recording, size: tuple[int, int], how: Fitting) -> Recording:

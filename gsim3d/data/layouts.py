@@ -6,11 +6,13 @@ A layout is a module with NAME, FILE (the name of the description file), ``recog
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from types import ModuleType
 
 from gsim3d.data import colmap, genesis, kubric, transforms, videos
-from gsim3d.data.recording import natural_order
+from gsim3d.data.actions import read_actions
+from gsim3d.data.recording import Problems, Recording, natural_order
 from gsim3d.errors import InputError
 
 LAYOUTS = (kubric, genesis, transforms, videos, colmap)  # in order of precedence
@@ -23,6 +25,12 @@ def layout_of(folder: str | Path) -> ModuleType:
     if found is None:
         raise InputError(f"{folder} is not a scene folder: it has no {_files()} (see docs/reference/data.md)")
     return found
+
+
+def read(folder: Path, problems: Problems) -> Recording:
+    """Reads a scene folder of any layout, and its actions."""
+    recording = layout_of(folder).read(folder, problems)
+    return dataclasses.replace(recording, actions=read_actions(folder, recording.n_steps, problems))
 
 
 def find_scenes(root: str | Path) -> list[Path]:

@@ -56,6 +56,19 @@ class Lens:
         return same and np.array_equal(self.coefficients, other.coefficients)
 
 
+@dataclass(frozen=True, eq=False)
+class RecordedActions:
+    """Points of actors at every step of a recording.
+
+    Attributes:
+        positions: float64 [T, A, 3] metres.
+        types: type of each point.
+    """
+
+    positions: np.ndarray
+    types: tuple[str, ...]
+
+
 @dataclass(frozen=True)
 class Camera:
     """One camera of a recording, in gsim3d's conventions.
@@ -96,6 +109,7 @@ class Recording:
         subtract_background: derive labels by background subtraction.
         notes: remarks about skipped or changed data; check-data prints them.
         world_offset: float64 [3] metres, origin of all positions in the coordinates of the files; readers return 0.
+        actions: points of actors; None: no actors.
     """
 
     layout: str
@@ -117,6 +131,7 @@ class Recording:
     subtract_background: bool = False
     notes: tuple[str, ...] = ()
     world_offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    actions: RecordedActions | None = None
 
     @classmethod
     def of_cameras(cls, cameras: Sequence[Camera], n_steps: int, **others: Any) -> Recording:
@@ -130,6 +145,11 @@ class Recording:
             distortions=tuple(camera.lens for camera in cameras),
             **others,
         )
+
+    def changed_actions(self, change: Callable[[np.ndarray], np.ndarray]) -> RecordedActions | None:
+        """Returns ``actions`` with positions changed by a function."""
+        actions = self.actions
+        return actions and RecordedActions(change(actions.positions), actions.types)
 
     def cameras_at_step(self, step: int) -> tuple[np.ndarray, np.ndarray]:
         """Returns viewmats [V, 4, 4] and Ks [V, 3, 3] of a step."""

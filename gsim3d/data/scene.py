@@ -97,7 +97,7 @@ class Scene:
         """
         path = Path(folder)
         problems = Problems()
-        recording = layouts.layout_of(path).read(path, problems)
+        recording = layouts.read(path, problems)
         check_directions(recording, problems)
         if fps is not None:
             recording = resample(recording, fps)

@@ -123,6 +123,8 @@ def read_world(folder: Path) -> World:
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{file} is not of a set that this version can generate: {error}") from error
     world.check()
+    if world.name not in ERRORS:
+        raise InputError(f"{folder}: there is no bound for the world {world.name}; choose from {', '.join(ERRORS)}")
     return world
 
 

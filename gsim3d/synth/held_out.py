@@ -21,7 +21,7 @@ class Origin:
     """Generator options of a scene.
 
     Attributes:
-        world: "elastic", "rigid" or "cloth".
+        world: a key of worlds.WORLDS.
         subset: held-out variant of the world; None: the training variant.
         seed: seed of the set.
         body: name of the object.

@@ -19,30 +19,38 @@ from gsim3d.synth.world import SceneBody
 OBJECTS = ("box", "cylinder", "capsule", "spot")  # bodies that do not roll away
 SIZE = 0.42  # diameter of the enclosing sphere of a body in metres
 DENSITY = 60.0  # kg/m^3 of the bounding box: light enough for the contacts of a kinematic pusher
+FRICTION, BOUNCE = (0.4, 0.9), (0.1, 0.7)  # ranges for bodies that are not in synth.bodies.CONTACTS
 PUSHER_RADIUS, PUSHER_COLOR = 0.08, (0.85, 0.15, 0.1)
 SUBSTEP = 1 / 480  # largest time step in seconds
 SETTLE = 0.5  # seconds that are simulated before an episode, until bodies rest
 
 
-def draw_body(name: str, position: np.ndarray, angle: float) -> SceneBody:
-    """Returns a body on the ground, whose appearance, size and contacts depend on its name only.
+def draw_body(
+    name: str, position: np.ndarray, angle: float, size: float = SIZE, rng: np.random.Generator | None = None
+) -> SceneBody:
+    """Returns a body on the ground.
 
     Args:
         name: one of ``synth.bodies.OBJECTS``.
         position: horizontal position of its center [2] in metres.
         angle: rotation about the z axis in rad.
+        size: diameter of its enclosing sphere in metres.
+        rng: draws appearance and contacts; None: they depend on the name only.
     """
-    body = named_body(name, name_rng(name))
+    body = named_body(name, name_rng(name) if rng is None else rng)
     c, s = np.cos(angle), np.sin(angle)
-    rotation = SIZE * np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    rotation = size * np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     vertices, collision = body.vertices @ rotation.T, body.collision_vertices @ rotation.T
     offset = np.array([*position, -collision[:, 2].min()])
     vertices, collision = vertices + offset, collision + offset
     mass = DENSITY * float(np.prod(np.ptp(collision, axis=0)))
-    friction, bounce = named_contact(name, (0.4, 0.9), (0.1, 0.7))
+    if rng is None:
+        friction, bounce = named_contact(name, FRICTION, BOUNCE)
+    else:
+        friction, bounce = rng.uniform(*FRICTION), rng.uniform(*BOUNCE)
     parts = tuple(meshes.convex_pieces(collision, body.collision_faces))
     rigid = RigidBody(parts, np.zeros(3), np.zeros(3), mass, friction, bounce)
-    facts = {"object": name, "mass": round(mass, 6), "size": SIZE, "friction": friction, "bounce": bounce}
+    facts = {"object": name, "mass": round(mass, 6), "size": size, "friction": friction, "bounce": bounce}
     return SceneBody(rigid, render.Surface(body.faces, body.corners, body.paint), vertices, facts)
 
 

@@ -187,12 +187,13 @@ def write_trajectory(world: World, scene: tuple[str, int], file: str) -> str:
         world: settings of the world.
         scene: object and sample.
         file: .npz file to write: images uint8 [T, V, H, W, 4] (RGB and segmentation), viewmats [V, 4, 4] and
-            Ks [V, 3, 3].
+            Ks [V, 3, 3]; with actors also actions [T, A, 3].
 
     Returns:
         ``file``.
     """
     made = world.make(*scene)
     images = np.stack([np.concatenate([view.rgb, view.segmentation[..., None]], -1) for view in made.views])
-    np.savez(file, images=images, viewmats=made.rig.viewmats, Ks=made.rig.Ks)
+    actions = {} if made.actions is None else {"actions": made.actions}
+    np.savez(file, images=images, viewmats=made.rig.viewmats, Ks=made.rig.Ks, **actions)
     return file

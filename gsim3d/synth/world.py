@@ -12,6 +12,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -65,13 +66,15 @@ class SceneDraw:
         ground: height of the ground in metres; None: no ground.
         cloth: cloth; None: no cloth.
         bodies: bodies.
-        surfaces: surfaces of the bodies, and of the cloth last.
+        surfaces: surfaces of the bodies, then of the cloth, then of the actors.
+        policy: how the actors move; None: no actors.
     """
 
     ground: float | None
     cloth: Cloth | None
     bodies: list[SceneBody]
     surfaces: list[render.Surface]
+    policy: Any = None
 
 
 @dataclass(frozen=True)
@@ -115,6 +118,7 @@ class World(ABC):
 
     name = ""
     engines = tuple(ENGINES)
+    actors = ()  # types of the actors' points; a scene has the first of them
 
     def check(self) -> None:
         """Raises InputError for invalid options."""
@@ -246,7 +250,9 @@ class World(ABC):
             except (Unstable, Rejected) as reason:
                 rejected.append(str(reason))
                 continue
-            names = [f"body_{index}" for index in range(len(drawn.bodies))] + ["cloth"]
+            names = [f"body_{index}" for index in range(len(drawn.bodies))]
+            names += ["cloth"] * (drawn.cloth is not None) + ["actors"] * bool(self.actors)
+            actions = embeddings[-1].nodes.astype(np.float32) if self.actors else None
             renderer = self.renderer(rig, drawn)
             return writer.Scene(
                 name,
@@ -261,6 +267,8 @@ class World(ABC):
                     "bodies": [body.facts for body in drawn.bodies],
                 },
                 fingerprint=self.fingerprint(name),
+                actions=actions,
+                action_types=() if actions is None else self.actors[: actions.shape[1]],
             )
         raise InputError(
             f"{name}: all {MAX_ATTEMPTS} draws were rejected ({Counter(rejected).most_common(1)[0][0]}); "
@@ -275,7 +283,7 @@ class World(ABC):
         surfaces = [body.surface for body in bodies]
         if cloth is not None:
             surfaces.append(self._cloth_surface(cloth, rng))
-        return SceneDraw(ground, cloth, bodies, surfaces)
+        return self._with_actors(SceneDraw(ground, cloth, bodies, surfaces), rng)
 
     def renderer(self, rig: cameras.Rig, drawn: SceneDraw) -> render.Renderer:
         """Renderer of a draw with the cameras ``rig``."""
@@ -289,7 +297,8 @@ class World(ABC):
         """Simulates a draw, without checks.
 
         Returns:
-            Embeddings of the bodies and of the cloth last, and the vertices [T, V, 3] of every surface.
+            Embeddings of the bodies, of the cloth, and of the actors (a ParticleCloud of their points) last, and the
+            vertices [T, V, 3] of every surface.
 
         Raises:
             Unstable: the solver diverges.
@@ -374,6 +383,10 @@ class World(ABC):
 
     def _draw_cloth(self, rng: np.random.Generator) -> Cloth | None:
         return None
+
+    def _with_actors(self, drawn: SceneDraw, rng: np.random.Generator) -> SceneDraw:
+        """Adds the policy and the surface of actors to a draw."""
+        return drawn
 
     def _check_trajectory(self, rig: cameras.Rig, drawn: SceneDraw, moved: list[np.ndarray]) -> None:
         """Raises Unstable or Rejected for the vertices ``moved`` [T, V, 3] of all surfaces."""

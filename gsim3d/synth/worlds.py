@@ -1,4 +1,4 @@
-"""The worlds elastic, rigid and cloth; presets and held-out sets are in assets/presets.yaml."""
+"""The worlds elastic, rigid and cloth, and the list of all; presets and held-out sets are in assets/presets.yaml."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from gsim3d.errors import InputError, did_you_mean
 from gsim3d.io.plain import parse_yaml
 from gsim3d.synth import bodies, meshes, shapes
+from gsim3d.synth.acting import Push
 from gsim3d.synth.scene_setup import Cloth, Material, RigidBody, SoftBody
 from gsim3d.synth.world import TRAIN, World
 
@@ -158,7 +159,7 @@ def _with_tuples(value):
     return tuple(value) if isinstance(value, list) else value
 
 
-WORLDS = {"elastic": Elastic, "rigid": Rigid, "cloth": ClothWorld}
+WORLDS = {"elastic": Elastic, "rigid": Rigid, "cloth": ClothWorld, "push": Push}
 _FILE = _with_tuples(parse_yaml((Path(__file__).parent / "assets" / "presets.yaml").read_bytes()))
 PRESETS = _FILE["presets"]  # preset -> world -> options
 HELD_OUT = _FILE["held_out"]  # preset -> set -> world -> options on top of the preset

@@ -1,7 +1,8 @@
 """Scene folders and the manifest of a generated data set.
 
-Layout: OUT/<object>/<sample>/metadata.json, cam_<j>/{rgb,seg,inst,depth}_<step>.png, states.npz; OUT/manifest.json;
-OUT/effects.yaml (see gsim3d.effects.spec). A scene is written to a hidden folder, which is renamed when complete.
+Layout: OUT/<object>/<sample>/metadata.json, cam_<j>/{rgb,seg,inst,depth}_<step>.png, states.npz, actions.npz;
+OUT/manifest.json; OUT/effects.yaml (see gsim3d.effects.spec). A scene is written to a hidden folder, which is renamed
+when complete.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from gsim3d.synth.render import View
 
 GENERATOR_VERSION = 3  # increased whenever the bytes for given options change
 FILE_TEMPLATE = "cam_{cam_ix}/{img_type}_{n_step:04d}"
+ACTIONS_FILE = "actions.npz"  # see gsim3d.data.actions
 PNG_COMPRESSION = 3
 DEPTH_UNIT = 1e-4  # unit of the 16-bit depth images in metres
 MAX_DEPTH = 6.5  # largest depth in metres that fits
@@ -46,6 +48,8 @@ class Scene:
         states: name of a body or "cloth" -> nodes of its embedding, float32 [T, ..., 3] in metres.
         extras: additional keys of metadata.json.
         fingerprint: hash of the options that the scene depends on.
+        actions: positions of the actors' points, float32 [T, A, 3] in metres; None: no actors.
+        action_types: type of each point.
     """
 
     object: str
@@ -56,6 +60,8 @@ class Scene:
     states: dict[str, np.ndarray]
     extras: dict
     fingerprint: str
+    actions: np.ndarray | None = None
+    action_types: tuple[str, ...] = ()
 
 
 def scene_folder(out: Path, name: str, sample: int) -> Path:
@@ -101,6 +107,8 @@ def write_scene(out: Path, scene: Scene) -> Path:
     for name, nodes in scene.states.items():
         states_hash.update(name.encode() + nodes.tobytes())
     np.savez(unfinished / "states.npz", **scene.states)
+    if scene.actions is not None:
+        np.savez(unfinished / ACTIONS_FILE, positions=scene.actions, types=np.array(scene.action_types))
     hashes = {"states_sha256": states_hash.hexdigest(), "images_sha256": images_hash.hexdigest()}
     write_whole(unfinished / "metadata.json", json.dumps({**_metadata(scene), **hashes}, indent=1) + "\n")
     os.replace(unfinished, folder)

@@ -10,7 +10,7 @@ from gsim3d.cli.main import main
 from gsim3d.errors import InputError
 from gsim3d.synth import bound as module, generate
 from gsim3d.synth.bound import ERRORS, GIVEN, StartErrors, bound, read_given
-from gsim3d.synth.worlds import WORLDS, build_world
+from gsim3d.synth.worlds import build_world
 
 SMALL = {"image_size": 32, "n_frames": 7, "n_cams": 2, "n_trajectories": 2, "samples": 1, "objects": ("box", "spot")}
 ONE = {"processes": 1, "progress": False}
@@ -19,12 +19,12 @@ ONE = {"processes": 1, "progress": False}
 @pytest.fixture(scope="module")
 def sets(tmp_path_factory):
     root = tmp_path_factory.mktemp("sets")
-    for world in WORLDS:
+    for world in ERRORS:
         generate(root / world, world, preset="published", **SMALL, **ONE)
     return root
 
 
-@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("world", ERRORS)
 def test_bound_without_errors_reproduces_the_set(sets, world, monkeypatch):
     monkeypatch.setitem(module.ERRORS, world, StartErrors(0.0))
     summary = bound(sets / world, **ONE)
@@ -34,7 +34,7 @@ def test_bound_without_errors_reproduces_the_set(sets, world, monkeypatch):
             assert summary[kind][metric] == [100.0, 0.0] and summary["scenes"]["spot/0000"][kind][metric] == 100
 
 
-@pytest.mark.parametrize("world", WORLDS)
+@pytest.mark.parametrize("world", ERRORS)
 def test_start_errors_have_their_lengths_at_the_last_given_step(world):
     """Positions differ by the error of position, and that of velocity for each step before or after."""
     settings = build_world(world, "published", {**SMALL, "drop_height": (0.9, 0.9), "fps": 42.0})
@@ -58,6 +58,12 @@ def test_start_errors_have_their_lengths_at_the_last_given_step(world):
     assert (spin > 0.1) == (world == "rigid")
     if world == "rigid":
         np.testing.assert_allclose(turned(6), errors.spin * spin * (6 - last) / settings.fps, rtol=0.2, atol=3e-5)
+
+
+def test_bound_refuses_worlds_without_errors(tmp_path):
+    generate(tmp_path, "push", **{**SMALL, "n_trajectories": 1}, **ONE)
+    with pytest.raises(InputError, match="no bound for the world push; choose from elastic"):
+        bound(tmp_path, **ONE)
 
 
 def test_bound_summary_means_and_standard_errors():

@@ -1,0 +1,62 @@
+"""Worlds with actors: recorded positions, lengths of motions, determinism, and files that check-data accepts."""
+
+import numpy as np
+import pytest
+
+from gsim3d.data import Scene
+from gsim3d.data.check import check_scene
+from gsim3d.errors import InputError
+from gsim3d.synth import generate
+from gsim3d.synth.pushing import PUSHER_RADIUS
+from gsim3d.synth.scene_setup import Unstable
+from gsim3d.synth.world import Rejected
+from gsim3d.synth.worlds import build_world
+
+SMALL = {"image_size": 32, "n_frames": 6, "n_cams": 2, "n_trajectories": 2, "samples": 1}
+
+
+@pytest.fixture(scope="module")
+def pushes(tmp_path_factory):
+    return generate(tmp_path_factory.mktemp("pushes"), "push", processes=1, progress=False, **SMALL).folders
+
+
+def test_push_scenes_record_the_center_of_the_pusher(pushes):
+    for folder in pushes:
+        assert not check_scene(folder).problems
+        scene, states = Scene.open(folder), np.load(folder / "states.npz")
+        actions = scene.recording.actions
+        assert actions.types == ("pusher",) and actions.positions.shape == (6, 1, 3)
+        np.testing.assert_array_equal(actions.positions, states["actors"])
+        np.testing.assert_allclose(actions.positions[..., 2], PUSHER_RADIUS, atol=1e-6)
+        steps = np.linalg.norm(np.diff(actions.positions[:, 0], axis=0), axis=1) * scene.fps
+        assert (steps < 0.5 + 1e-5).all() and (steps > 0.3 - 1e-5).all()
+        seen = scene.cameras_at([0], [3])
+        local = seen.viewmats[0].double().numpy() @ np.array([*actions.positions[3, 0], 1.0])
+        x, y = (seen.Ks[0].double().numpy() @ local[:3])[:2] / local[2]
+        assert scene.segmentation([0], [3])[0, 0, int(y), int(x)] == 3  # it is seen as a body
+
+
+def test_pushes_are_long_and_their_pushers_start_clear_of_bodies():
+    world, pushed, scripted = build_world("push", "published", {"n_cams": 2}), [], 0
+    for scene in [(name, sample) for sample in range(5) for name in world.object_names()]:
+        for attempt in range(10):
+            drawn = world.draw(*scene, attempt)
+            centers = [(body.vertices[:, :2].min(0) + body.vertices[:, :2].max(0)) / 2 for body in drawn.bodies]
+            assert min(np.linalg.norm(centers - drawn.policy.start, axis=1)) > 0.3
+            _, moved = world.simulate(drawn)
+            try:
+                world._check_trajectory(world.rig(), drawn, moved)
+            except (Unstable, Rejected):
+                continue
+            break
+        scripted += drawn.policy.legs[0][0] >= 0
+        pushed.append(max(np.linalg.norm((body[-1] - body[0]).mean(0)[:2]) for body in moved[:-1]))
+        again = world.simulate(world.draw(*scene, attempt))[1]
+        assert all(np.array_equal(a, b) for a, b in zip(moved, again))
+    assert np.median(pushed) > 0.25 and 10 <= scripted < 20
+
+
+def test_push_refuses_mesh_files(tmp_path):
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n")
+    with pytest.raises(InputError, match="push has no mesh files"):
+        build_world("push", "mini", {"meshes": (str(tmp_path / "a.obj"),)})
