@@ -1,9 +1,10 @@
-"""Gymnasium environments: a pusher that moves rigid bodies to goals.
+"""Gymnasium environments: a pusher that moves rigid bodies to goals, in MuJoCo or in a learned simulator.
 
 ``import gsim3d.envs`` registers them::
 
     import gymnasium, gsim3d.envs
     env = gymnasium.make("gsim3d/PushToGoal-v0")
+    envs = gymnasium.make_vec("gsim3d/PushToGoal-v0", num_envs=8, backend="model", model="path/to/checkpoint")
 
 They need the packages gymnasium and MuJoCo: ``pip install 'gsim3d[envs]'``.
 """
@@ -15,11 +16,15 @@ try:
 except ImportError:
     raise InputError("gsim3d.envs needs the package gymnasium: pip install 'gsim3d[envs]'") from None
 
-from gsim3d.envs.push import MAX_STEPS, PushClear, PushToGoal
+from gsim3d.envs import push
+from gsim3d.envs.push import PushClear, PushToGoal
 
 __all__ = ["PushClear", "PushToGoal"]
 
-for _env in (PushToGoal, PushClear):
+for _env, _max_steps in ((PushToGoal, push.MAX_STEPS), (PushClear, push.MAX_STEPS)):
     gymnasium.register(
-        f"gsim3d/{_env.__name__}-v0", entry_point=f"gsim3d.envs.push:{_env.__name__}", max_episode_steps=MAX_STEPS
+        f"gsim3d/{_env.__name__}-v0",
+        entry_point=f"{_env.__module__}:{_env.__name__}",
+        vector_entry_point=f"{_env.__module__}:{_env.__name__}Vector",
+        max_episode_steps=_max_steps,
     )

@@ -44,11 +44,12 @@ class TrueDynamics:
         """Positions after each of ``actions`` [K, H, 2], m/s, from ``state``."""
         simulation, shape = self.simulation, tuple(actions.shape)
         centers, pusher = np.full(shape, np.nan), np.full(shape, np.nan)
-        for k, sequence in enumerate(actions.double().cpu().numpy()):
+        for k, sequence in enumerate(actions.double().cpu()):
             simulation.restore(state)
             try:
                 for step, action in enumerate(sequence):
-                    simulation.step(bounded_velocity(simulation.pusher[:2], action))
+                    velocity = bounded_velocity(torch.from_numpy(simulation.pusher[:2]), action)
+                    simulation.step(velocity.numpy())
                     centers[k, step], pusher[k, step] = simulation.centers[0, :2], simulation.pusher[:2]
             except Unstable:
                 continue

@@ -104,7 +104,7 @@ def test_episodes_end_when_solved_or_after_sixty_steps():
     flags = [env.step(np.zeros(2, np.float32))[2:4] for _ in range(60)]
     assert flags[-1] == (False, True) and not any(any(flag) for flag in flags[:-1])
     env.reset(seed=0)
-    task.goal = task.simulation.centers[0, :2] + 0.5 * REACHED
+    task._episodes.goals[0] = torch.from_numpy(task.simulation.centers[0, :2] + 0.5 * REACHED)
     _, reward, terminated, _, info = env.step(np.zeros(2, np.float32))
     assert terminated is True and info["is_success"] is True and -REACHED < reward < 0
 
@@ -112,9 +112,10 @@ def test_episodes_end_when_solved_or_after_sixty_steps():
 def test_a_cleared_region_is_solved():
     task = PushClear()
     task.reset(seed=2)
-    centers = task.simulation.centers[:, :2]
-    assert task._distance(centers) > 0 and not task._solved(centers)
-    assert task._solved(centers / np.linalg.norm(centers, axis=1, keepdims=True))
+    centers, goals = task.scenes.centers(), torch.zeros(1, 2)
+    assert PushClear.distances(task.scenes, goals) > 0
+    task.scenes.centers = lambda: centers / centers[..., :2].norm(dim=-1, keepdim=True)
+    assert PushClear.solved(PushClear.distances(task.scenes, goals))
 
 
 @pytest.mark.parametrize("action", [np.zeros(3), np.array([np.nan, 0]), np.array([2 * MAX_SPEED, 0])])
@@ -123,7 +124,7 @@ def test_wrong_actions_are_refused(action):
     with pytest.raises(InputError, match="before reset"):
         task.step(np.zeros(2))
     task.reset(seed=0)
-    with pytest.raises(InputError, match="action must be two velocities"):
+    with pytest.raises(InputError, match="action must be 2 numbers"):
         task.step(action)
 
 

@@ -1,0 +1,236 @@
+"""Scenes of environments in a learned simulator: encoded from images of the truth, moved by kinematic particles."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsim3d.cameras import Cameras, Frames, InputSpec
+from gsim3d.effects.actors import Actor
+from gsim3d.effects.selection import Selection, newest_mask
+from gsim3d.envs.scenes import FPS, N_PARTICLES, Scenes, TrueScene, padded, task_rig
+from gsim3d.errors import InputError
+from gsim3d.nn.multiview_encoder import pixel_rows
+from gsim3d.simulator import Simulator
+from gsim3d.state import Particles, append_step, concatenate, last_steps, newest_clouds
+from gsim3d.synth import cameras, render
+
+
+@dataclass(frozen=True)
+class ActorRows(Selection):
+    """The particles whose attribute ``actor`` is ``number``.
+
+    Attributes:
+        number: of the actor.
+    """
+
+    number: int = 0
+
+    def mask(self, particles: Particles) -> Tensor:
+        return particles.actor == self.number
+
+
+@dataclass(frozen=True)
+class ModelState:
+    """State of :class:`ModelScenes`.
+
+    Attributes:
+        particles: last steps of every scene; ``actor`` marks the particles of actors.
+        actors: float64 [n, A, 3] metres, centers of the actors.
+    """
+
+    particles: Particles
+    actors: Tensor
+
+
+@dataclass(frozen=True)
+class Start:
+    """Images that a scene is encoded from.
+
+    Attributes:
+        views: of the last steps, the newest last.
+        scene: the truth, now.
+    """
+
+    views: Sequence[render.View]
+    scene: TrueScene
+
+
+class ModelScenes(Scenes):
+    """Scenes side by side in one learned simulator, in one batch.
+
+    Centers of bodies follow the rigid motion that fits their points best, from the truth at the start.
+
+    Args:
+        simulator: trained at 12 frames a second, or at an unknown rate.
+        count: number of scenes, n.
+        most_bodies: largest number of bodies of a scene, B.
+        image_size: pixels of the input images, where the simulator does not know its own.
+
+    Attributes:
+        simulator: of all scenes.
+        plan: its default, without sleep.
+        rig: cameras of the input images.
+        history: number of steps that a scene is encoded from.
+        state: of all scenes; None before the first :meth:`reset`. May be replaced by another one of the same scenes.
+
+    Raises:
+        InputError: the simulator has another frame rate, or images that are not square.
+    """
+
+    def __init__(self, simulator: Simulator, count: int, most_bodies: int, image_size: int = 64):
+        inputs = simulator.inputs or InputSpec(history=0)
+        if inputs.fps not in (None, FPS):
+            raise InputError(f"model was trained at {inputs.fps:g} frames a second; environments have {FPS}")
+        sizes = set(inputs.image_size) or {image_size}
+        if len(sizes) > 1:
+            raise InputError(f"model has images of {inputs.image_size} pixels; environments have square ones")
+        effects = simulator.effects
+        self.plan = simulator.plan(
+            dataclasses.replace(effects, dynamics=dataclasses.replace(effects.dynamics, sleep=None))
+        )
+        self.simulator, self.count, self.most_bodies = simulator, count, most_bodies
+        self.inputs, self.history = inputs, inputs.history or self.plan.history
+        self.rig = task_rig(sizes.pop(), inputs.context_views)
+        self.device = next(simulator.parameters()).device
+        self.state: ModelState | None = None
+
+    def reset(self, started: Mapping[int, TrueScene], rngs: Mapping[int, np.random.Generator]) -> None:
+        self.encode({n: Start([scene.view(self.rig)] * self.history, scene) for n, scene in started.items()}, rngs)
+
+    @torch.no_grad()
+    def encode(self, started: Mapping[int, Start], rngs: Mapping[int, np.random.Generator]) -> None:
+        """Replaces scenes, by their numbers; ``rngs`` choose their points.
+
+        Raises:
+            InputError: no camera sees the bodies of a scene.
+        """
+        started = dict(sorted(started.items()))
+        frames, labels = self._frames(started)
+        particles = self.simulator.encode(frames)
+        label = pixel_rows(frames, labels)
+        n_bodies = torch.tensor([start.scene.n_bodies for start in started.values()], device=self.device)
+        n_bodies = n_bodies.repeat_interleave(self.history)[particles.row_cloud()]
+        actor = torch.where(label >= n_bodies, label - n_bodies, -1)
+        particles = dataclasses.replace(particles, actor=actor)
+        if self.simulator.dynamics.priors.get("segmentation") is not None:
+            particles = dataclasses.replace(particles, body=_body_centers(particles, label))
+        if self.plan.spec.dynamics.background == "masked_out":
+            particles, label = particles.select_rows(label >= 0), label[label >= 0]
+        self._merge(particles, started)
+        newest = newest_mask(particles)
+        labels = label[newest].split([particles.clouds.count(q) for q in newest_clouds(particles.clouds)])
+        for (number, start), of_scene in zip(started.items(), labels, strict=True):
+            self._choose(number, start.scene, of_scene, rngs[number])
+        chosen = list(started)
+        self._rest[chosen] = self.points()[chosen].double()
+
+    @torch.no_grad()
+    def move(self, velocities: Tensor) -> None:
+        moved = velocities / FPS
+        acting = [Actor(of_actor[:, None], ActorRows(number=a)) for a, of_actor in enumerate(moved.unbind(1))]
+        particles = self.state.particles
+        step = self.simulator.rollout(particles, 1, self.plan, actors=acting)[0]
+        self.state = ModelState(append_step(particles, step, self.plan.history), self.state.actors + moved)
+
+    def actors(self) -> Tensor:
+        return self.state.actors
+
+    def centers(self) -> Tensor:
+        return self.centers_of(self.points())
+
+    def centers_of(self, points: Tensor) -> Tensor:
+        """Centers of the bodies [..., n, B, 3] for positions [..., n, 256, 3] of their points."""
+        weights = self._members / self._members.sum(-1, keepdim=True).clamp_min(1)
+        before, after = weights @ self._rest, weights @ points.double()
+        arms = self._rest[:, None] - before[:, :, None], points.double()[..., None, :, :] - after[..., None, :]
+        u, _, vh = torch.linalg.svd(torch.einsum("nbp,...nbpi,nbpj->...nbij", weights, arms[1], arms[0]))
+        u = torch.cat([u[..., :2], u[..., 2:] * torch.linalg.det(u @ vh)[..., None, None]], -1)  # no mirroring
+        return after + ((u @ vh) @ (self._centers - before)[..., None])[..., 0]
+
+    def points(self) -> Tensor:
+        newest = last_steps(self.state.particles, 1)
+        return newest.means[newest.cu_rows[:-1, None] + self._rows]
+
+    @torch.no_grad()
+    def images(self, rig: cameras.Rig) -> Tensor:
+        newest, shown = last_steps(self.state.particles, 1), torch.arange(self.count, device=self.device)
+        views = _cameras(rig, shown.repeat_interleave(rig.n_cams))
+        color = self.simulator.render(newest, views, plan=self.plan).color
+        return (255 * color.clamp(0, 1) + 0.5).to(torch.uint8).unflatten(0, (self.count, rig.n_cams))
+
+    def _frames(self, started: Mapping[int, Start]) -> tuple[Frames, Tensor]:
+        """Input frames, and the label of each pixel: a body, then an actor, else negative."""
+        views = [view for start in started.values() for view in start.views]
+        clouds = torch.arange(len(views), device=self.device)
+        scenes = torch.tensor(list(started), device=self.device)
+        images, segments, labels = (
+            torch.from_numpy(np.concatenate([getattr(view, name) for view in views])).to(self.device)
+            for name in ("rgb", "segmentation", "instances")
+        )
+        frames = Frames(
+            images=images.permute(0, 3, 1, 2).float().div_(255),
+            cameras=_cameras(self.rig, clouds.repeat_interleave(self.rig.n_cams)),
+            cloud_scene=scenes.repeat_interleave(self.history),
+            cloud_step=torch.arange(self.history, device=self.device).repeat(len(started)),
+            origin=torch.from_numpy(cameras.workspace_origin(self.rig)).to(self.device).expand(self.count, 3),
+            masks=segments != render.BACKGROUND,
+            dynamic=segments == render.BODY,
+        )
+        labels = torch.where(frames.dynamic, labels.long() - render.FIRST_BODY, -1)
+        return frames.subsample(self.inputs.background_stride, self.inputs.body_stride), labels
+
+    def _merge(self, particles: Particles, started: Mapping[int, Start]) -> None:
+        """Replaces the scenes ``started`` of the state by ``particles``."""
+        actors = {number: torch.from_numpy(start.scene.actors) for number, start in started.items()}
+        if self.state is None or len(started) == self.count:
+            self._rows = torch.zeros(self.count, N_PARTICLES, dtype=torch.int64, device=self.device)
+            self._rest = torch.zeros(self.count, N_PARTICLES, 3, dtype=torch.float64, device=self.device)
+            self._members = torch.zeros(self.count, self.most_bodies, N_PARTICLES, device=self.device).double()
+            self._centers = torch.full((self.count, self.most_bodies, 3), torch.nan, device=self.device).double()
+            self.state = ModelState(particles, torch.stack(list(actors.values())).to(self.device))
+            return
+        old = self.state.particles
+        kept = old.select_clouds([q for q, scene in enumerate(old.clouds.scenes) if scene not in started])
+        positions = self.state.actors.clone()
+        for number, of_scene in actors.items():
+            positions[number] = of_scene
+        self.state = ModelState(concatenate([kept, particles]), positions)
+
+    def _choose(self, number: int, scene: TrueScene, labels: Tensor, rng: np.random.Generator) -> None:
+        """Chooses the points of a scene, an equal share of each body; ``labels`` are of its newest particles."""
+        share = -(-N_PARTICLES // scene.n_bodies)
+        rows, members = [], []
+        for body in range(scene.n_bodies):
+            known = (labels == body).nonzero()[:, 0]
+            if not len(known):
+                raise InputError(f"body {body} of scene {number} is not seen by any camera; reset with another seed")
+            rows.append(known[torch.from_numpy(rng.integers(len(known), size=share)).to(self.device)])
+            members += [body] * share
+        self._rows[number] = torch.cat(rows)[:N_PARTICLES]
+        of_points = torch.tensor(members[:N_PARTICLES], device=self.device)
+        self._members[number] = of_points == torch.arange(self.most_bodies, device=self.device)[:, None]
+        self._centers[number] = torch.from_numpy(padded(scene.centers, self.most_bodies)).to(self.device)
+
+
+def _cameras(rig: cameras.Rig, image_cloud: Tensor) -> Cameras:
+    """Cameras of a rig for each of several clouds; ``image_cloud`` [I] is the cloud of every image."""
+    viewmats, Ks = (torch.from_numpy(x).float().to(image_cloud.device) for x in (rig.viewmats, rig.Ks))
+    copies = len(image_cloud) // rig.n_cams
+    depths = (torch.full((len(image_cloud),), depth, device=image_cloud.device) for depth in (rig.near, rig.far))
+    return Cameras(viewmats.repeat(copies, 1, 1), Ks.repeat(copies, 1, 1), *depths, image_cloud, rig.size, rig.size)
+
+
+def _body_centers(particles: Particles, label: Tensor) -> Tensor:
+    """Mean position of the particles of the same label in the same cloud [N, 3]; the own position without a label."""
+    most = int(label.max()) + 1
+    of = particles.row_cloud() * (most + 1) + torch.where(label < 0, most, label)
+    points = torch.nn.functional.pad(particles.means.double(), (0, 1), value=1.0)
+    sums = points.new_zeros(particles.n_clouds * (most + 1), 4).index_add_(0, of, points)
+    means = (sums[:, :3] / sums[:, 3:]).to(particles.means)
+    return torch.where((label >= 0)[:, None], means[of], particles.means)

@@ -1,0 +1,356 @@
+"""Base of the environments: one episode, or many side by side, in MuJoCo or in a learned simulator."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from torch import Tensor
+
+from gsim3d.envs.model import ModelScenes
+from gsim3d.envs.scenes import FPS, N_PARTICLES, N_VIEWS, Scenes, TrueScene, TrueScenes, task_rig
+from gsim3d.errors import InputError
+from gsim3d.simulator import Simulator
+
+OBSERVATIONS = ("particles", "images", "both")
+BACKENDS = ("truth", "model")
+RENDER_MODES = ("rgb_array",)
+REACH = 2.0  # metres; bound of the positions of actors and goals
+
+
+class TaskEnv(gymnasium.Env):
+    """Base of the tasks.
+
+    Observations are a dictionary:
+
+    - ``goal`` [2], and the positions of actors: metres;
+    - ``particles`` [256, 3]: points of the bodies, metres; the same points at every step;
+    - ``images`` uint8 [4, H, W, 3]: of four calibrated cameras (``rig``).
+
+    Episodes are functions of the seed and equal in all bits.
+
+    Args:
+        observation: "particles", "images" or "both".
+        image_size: pixels, width and height of observed images.
+        render_mode: None or "rgb_array": the first camera.
+        backend: "truth": MuJoCo; "model": a learned simulator, which encodes images of the truth's start.
+        model: name or path of the simulator, for ``backend="model"``.
+        device: "cpu" or "cuda", of the simulator.
+
+    Attributes:
+        rig: cameras of the images.
+        goal: [2] metres.
+
+    Raises:
+        InputError: an argument is not known, or the simulator cannot be loaded.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": FPS}
+    max_bodies: ClassVar[int] = 1
+    actors: ClassVar[tuple[str, tuple[int, ...]] | None] = None  # name and shape of their observed positions
+    max_action: ClassVar[tuple[float, ...]]
+
+    def __init__(self, observation: str = "particles", image_size: int = 64, render_mode: str | None = None, **options):
+        self._episodes = Episodes(type(self), 1, observation, image_size, render_mode, **options)
+        self.render_mode, self.rig, self.scenes = render_mode, self._episodes.rig, self._episodes.scenes
+        self.observation_space, self.action_space = self._episodes.observation_space, self._episodes.action_space
+
+    @property
+    def goal(self) -> np.ndarray:
+        """[2] metres."""
+        return self._episodes.goals[0].cpu().numpy()
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        """The first observation of a new episode, and ``info``."""
+        super().reset(seed=seed)
+        self._episodes.begin({0: self.np_random})
+        return self._observe(), self._info()
+
+    def step(self, action: np.ndarray):
+        """One step: observation, reward, terminated, truncated, info.
+
+        Raises:
+            InputError: ``action`` is not inside the bounds, or no episode has begun.
+        """
+        self._episodes.act(torch.as_tensor(np.array(action, np.float64))[None])
+        info = self._info()
+        return self._observe(), -float(self._episodes.distances[0]), info["is_success"], False, info
+
+    def render(self) -> np.ndarray | None:
+        """uint8 [H, W, 3] of the first camera; None without a render mode."""
+        return self.scenes.images(self.rig)[0, 0].cpu().numpy() if self.render_mode == "rgb_array" else None
+
+    def _observe(self) -> dict[str, np.ndarray]:
+        return {name: value[0].cpu().numpy() for name, value in self._episodes.observe().items()}
+
+    def _info(self) -> dict[str, Any]:
+        found = {name: value[0].cpu().numpy() for name, value in self._episodes.info().items()}
+        exists = np.isfinite(found["centers"][:, 0])
+        return {**found, "is_success": bool(found["is_success"]), "centers": found["centers"][exists]}
+
+    @classmethod
+    @abstractmethod
+    def draw(cls, rng: np.random.Generator) -> TrueScene:
+        """The start of an episode."""
+
+    @classmethod
+    @abstractmethod
+    def act(cls, scenes: Scenes, actions: Tensor) -> Tensor:
+        """Simulates a step with ``actions`` [n, A]. Returns the executed ones."""
+
+    @classmethod
+    @abstractmethod
+    def distances(cls, scenes: Scenes, goals: Tensor) -> Tensor:
+        """How far scenes are from ``goals`` [n, 2], [n]; minus the reward."""
+
+    @classmethod
+    @abstractmethod
+    def solved(cls, distances: Tensor) -> Tensor:
+        """Whether scenes at ``distances`` [n] are solved, bool [n]."""
+
+
+class Episodes:
+    """n episodes of a task side by side.
+
+    Args:
+        task: the task.
+        count: n.
+        others: of :class:`TaskEnv`.
+
+    Attributes:
+        scenes: the simulated scenes.
+        goals: [n, 2] metres.
+        distances: [n], minus the rewards.
+        executed: executed actions [n, A].
+    """
+
+    def __init__(
+        self,
+        task: type[TaskEnv],
+        count: int,
+        observation: str = "particles",
+        image_size: int = 64,
+        render_mode: str | None = None,
+        backend: str = "truth",
+        model: str | None = None,
+        device: str = "cpu",
+    ):
+        for name, value, known in (("observation", observation, OBSERVATIONS), ("backend", backend, BACKENDS)):
+            if value not in known:
+                raise InputError(f"{name} must be one of {', '.join(known)}; got {value!r}")
+        if render_mode not in (None, *RENDER_MODES):
+            raise InputError(f"render_mode must be rgb_array or None; got {render_mode!r}")
+        if image_size < 1:
+            raise InputError(f"image_size must be at least 1; got {image_size}")
+        self.task, self.count, self.observation, self.rig = task, count, observation, task_rig(image_size)
+        self.scenes: Scenes
+        if backend == "model":
+            if model is None:
+                raise InputError('backend="model" needs model=PATH, a checkpoint of a trained simulator')
+            simulator = Simulator.from_pretrained(model, device=device)
+            self.scenes = ModelScenes(simulator, count, task.max_bodies, image_size)
+        elif model is not None or device != "cpu":
+            raise InputError('model and device are of backend="model"; MuJoCo simulates the truth on the CPU')
+        else:
+            self.scenes = TrueScenes(count, task.max_bodies)
+        self._high = torch.tensor(task.max_action, dtype=torch.float64, device=self.scenes.device)
+        self.goals = torch.zeros(count, 2, dtype=torch.float64, device=self.scenes.device)
+        self.action_space = spaces.Box(-self._high.float().cpu().numpy(), self._high.float().cpu().numpy())
+        self.observation_space = self._observations(image_size)
+        self.executed: Tensor | None = None
+
+    def _observations(self, image_size: int) -> spaces.Dict:
+        parts: dict[str, spaces.Space] = {"goal": spaces.Box(-REACH, REACH, (2,), np.float32)}
+        if self.task.actors is not None:
+            parts[self.task.actors[0]] = spaces.Box(-REACH, REACH, self.task.actors[1], np.float32)
+        if self.observation != "images":
+            parts["particles"] = spaces.Box(-10.0, 10.0, (N_PARTICLES, 3), np.float32)
+        if self.observation != "particles":
+            parts["images"] = spaces.Box(0, 255, (N_VIEWS, image_size, image_size, 3), np.uint8)
+        return spaces.Dict(parts)
+
+    def begin(self, rngs: Mapping[int, np.random.Generator]) -> None:
+        """Begins new episodes, drawn by the generators of their numbers."""
+        drawn = {number: self.task.draw(rng) for number, rng in rngs.items()}
+        points = {number: np.random.default_rng(rng.integers(2**63)) for number, rng in rngs.items()}
+        self.scenes.reset(drawn, points)
+        for number, scene in drawn.items():
+            self.goals[number] = torch.from_numpy(scene.goal)
+        if self.executed is None:
+            self.executed = self._high.expand(self.count, -1).clone()
+        self.executed[list(drawn)] = 0
+        self._measure()
+
+    def act(self, actions: Tensor) -> None:
+        """Simulates a step with ``actions`` [n, A].
+
+        Raises:
+            InputError: an action is not inside the bounds, or no episode has begun.
+        """
+        if self.executed is None:
+            raise InputError("step was called before reset")
+        actions = actions.to(self._high)
+        shape = (self.count, len(self._high))
+        if actions.shape != shape or not bool((actions.abs() <= self._high + 1e-6).all()):
+            bounds = ", ".join(f"{high:g}" for high in self.task.max_action)
+            raise InputError(
+                f"action must be {shape[1]} numbers of at most {bounds} in absolute value; got {actions.tolist()}"
+            )
+        self.executed = self.task.act(self.scenes, actions)
+        self._measure()
+
+    def _measure(self) -> None:
+        self.distances = self.task.distances(self.scenes, self.goals)
+        self.solved = self.task.solved(self.distances)
+
+    def observe(self) -> dict[str, Tensor]:
+        """Observations [n, ...]."""
+        found = {"goal": self.goals.float()}
+        if self.task.actors is not None:
+            name, shape = self.task.actors
+            found[name] = self.scenes.actors()[..., : shape[-1]].reshape(self.count, *shape).float()
+        if self.observation != "images":
+            found["particles"] = self.scenes.points()
+        if self.observation != "particles":
+            found["images"] = self.scenes.images(self.rig)
+        return found
+
+    def info(self) -> dict[str, Tensor]:
+        """Facts [n, ...]."""
+        centers = self.scenes.centers()[..., :2]
+        return {"is_success": self.solved, "centers": centers, "velocity": self.executed.clone()}
+
+
+class TaskVectorEnv(VectorEnv):
+    """Episodes of a task side by side; a learned simulator predicts them in one batch.
+
+    Observations, rewards and flags are tensors on the device of the simulator, without copies
+    (``metadata["torch"]``); environment i equals a single one of seed ``seed + i``.
+
+    Args:
+        num_envs: number of environments, n.
+        max_episode_steps: steps until an episode is truncated; None: never.
+        autoreset_mode: as in Gymnasium: NEXT_STEP, SAME_STEP or DISABLED, or its value.
+        others: as of a single environment.
+
+    Raises:
+        InputError: as of a single environment.
+    """
+
+    task: ClassVar[type[TaskEnv]]
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        max_episode_steps: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        **options,
+    ):
+        if num_envs < 1:
+            raise InputError(f"num_envs must be at least 1; got {num_envs}")
+        self._episodes = Episodes(self.task, num_envs, **options)
+        self.mode, self.num_envs = AutoresetMode(autoreset_mode), num_envs
+        self.metadata = {**self.task.metadata, "torch": True, "autoreset_mode": self.mode}
+        self.render_mode, self._most_steps = options.get("render_mode"), max_episode_steps
+        self.single_observation_space = self._episodes.observation_space
+        self.single_action_space = self._episodes.action_space
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.scenes, self._rngs = self._episodes.scenes, {}
+        self._steps, self._over = np.zeros(num_envs, np.int64), np.zeros(num_envs, bool)
+
+    @property
+    def np_random(self) -> tuple[np.random.Generator, ...]:
+        """Random generators of the environments."""
+        return tuple(self._generator(number) for number in range(self.num_envs))
+
+    def reset(self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None):
+        """The first observations of new episodes, and infos.
+
+        Args:
+            seed: of environment i: ``seed + i``, or element i; None: the random numbers go on.
+            options: "reset_mask", bool [n]: environments to reset. Default: all.
+
+        Raises:
+            InputError: seeds or mask have a wrong length, or the first reset is not of all environments.
+        """
+        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed or [None] * self.num_envs
+        chosen = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, bool)))
+        if len(seeds) != self.num_envs or chosen.shape != (self.num_envs,) or chosen.dtype != bool:
+            raise InputError(f"seed and reset_mask must be of {self.num_envs} environments")
+        if self._episodes.executed is None and not chosen.all():
+            raise InputError("reset_mask: the first reset must be of all environments")
+        for number in chosen.nonzero()[0].tolist():
+            if seeds[number] is not None:
+                self._rngs[number] = seeding.np_random(seeds[number])[0]
+        self._begin(chosen)
+        return self._episodes.observe(), self._infos(self._episodes.info(), chosen)
+
+    def step(self, actions: Tensor | np.ndarray):
+        """One step of all environments: observations, rewards [n], terminations [n], truncations [n], infos.
+
+        Args:
+            actions: [n, A].
+
+        Raises:
+            InputError: an action is not inside the bounds, or an environment has ended and must be reset.
+        """
+        episodes, over = self._episodes, self._over
+        if self.mode is AutoresetMode.DISABLED and over.any():
+            raise InputError(f"environments {over.nonzero()[0].tolist()} have ended; reset them with reset_mask")
+        actions = torch.as_tensor(actions, device=self.scenes.device)
+        if not over.all():
+            episodes.act(actions)
+        self._begin(over)
+        self._steps += ~over
+        begun = torch.from_numpy(over).to(self.scenes.device)
+        rewards = (-episodes.distances).masked_fill(begun, 0.0)
+        terminated = episodes.solved & ~begun
+        late = self._steps >= (np.inf if self._most_steps is None else self._most_steps)
+        truncated = torch.from_numpy(late).to(self.scenes.device)
+        self._over = late | terminated.cpu().numpy()
+        infos = self._infos(episodes.info(), np.ones(self.num_envs, bool))
+        observed = episodes.observe()
+        if self.mode is AutoresetMode.SAME_STEP and self._over.any():
+            infos = self._final(observed, infos)
+            self._begin(self._over)
+            infos |= self._infos(episodes.info(), np.ones(self.num_envs, bool))
+            observed = episodes.observe()
+        return observed, rewards, terminated, truncated, infos
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """uint8 [H, W, 3] of the first camera of each environment; None without a render mode."""
+        if self.render_mode is None:
+            return None
+        return tuple(self.scenes.images(self._episodes.rig)[:, 0].cpu().numpy())
+
+    def _generator(self, number: int) -> np.random.Generator:
+        if number not in self._rngs:
+            self._rngs[number] = seeding.np_random()[0]
+        return self._rngs[number]
+
+    def _begin(self, chosen: np.ndarray) -> None:
+        if chosen.any():
+            self._episodes.begin({number: self._generator(number) for number in chosen.nonzero()[0].tolist()})
+        self._steps[chosen] = 0
+        self._over = self._over & ~chosen
+
+    def _final(self, observed: dict[str, Tensor], infos: dict[str, Any]) -> dict[str, Any]:
+        """Infos with the last observations and infos of the episodes that have ended."""
+        final = np.full(self.num_envs, None, dtype=object)
+        for number in self._over.nonzero()[0].tolist():
+            final[number] = {name: value[number] for name, value in observed.items()}
+        kept = {name: value for name, value in infos.items() if not name.startswith("_")}
+        found = {"final_obs": final, "final_info": self._infos(kept, self._over)}
+        return {**infos, **self._infos(found, self._over)}
+
+    def _infos(self, found: dict[str, Any], chosen: np.ndarray) -> dict[str, Any]:
+        return {**found, **{f"_{name}": chosen.copy() for name in found}}
