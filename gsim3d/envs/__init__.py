@@ -1,4 +1,4 @@
-"""Gymnasium environments: a pusher that moves rigid bodies to goals, in MuJoCo or in a learned simulator.
+"""Gymnasium environments: push, throw and cover, in MuJoCo or in a learned simulator.
 
 ``import gsim3d.envs`` registers them::
 
@@ -16,12 +16,15 @@ try:
 except ImportError:
     raise InputError("gsim3d.envs needs the package gymnasium: pip install 'gsim3d[envs]'") from None
 
-from gsim3d.envs import push
+from gsim3d.envs import cloth, push
+from gsim3d.envs.cloth import ClothCover
 from gsim3d.envs.push import PushClear, PushToGoal
+from gsim3d.envs.throw import ThrowToTarget
 
-__all__ = ["PushClear", "PushToGoal"]
+__all__ = ["ClothCover", "PushClear", "PushToGoal", "ThrowToTarget"]
 
-for _env, _max_steps in ((PushToGoal, push.MAX_STEPS), (PushClear, push.MAX_STEPS)):
+_MAX_STEPS = {PushToGoal: push.MAX_STEPS, PushClear: push.MAX_STEPS, ThrowToTarget: None, ClothCover: cloth.MAX_STEPS}
+for _env, _max_steps in _MAX_STEPS.items():
     gymnasium.register(
         f"gsim3d/{_env.__name__}-v0",
         entry_point=f"{_env.__module__}:{_env.__name__}",

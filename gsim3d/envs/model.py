@@ -17,8 +17,9 @@ from gsim3d.envs.scenes import FPS, N_PARTICLES, Scenes, TrueScene, padded, task
 from gsim3d.errors import InputError
 from gsim3d.nn.multiview_encoder import pixel_rows
 from gsim3d.simulator import Simulator
-from gsim3d.state import Particles, append_step, concatenate, last_steps, newest_clouds
+from gsim3d.state import DYNAMIC, Particles, append_step, concatenate, last_steps, newest_clouds
 from gsim3d.synth import cameras, render
+from gsim3d.synth.scene_setup import GRAVITY
 
 
 @dataclass(frozen=True)
@@ -117,7 +118,7 @@ class ModelScenes(Scenes):
         n_bodies = torch.tensor([start.scene.n_bodies for start in started.values()], device=self.device)
         n_bodies = n_bodies.repeat_interleave(self.history)[particles.row_cloud()]
         actor = torch.where(label >= n_bodies, label - n_bodies, -1)
-        particles = dataclasses.replace(particles, actor=actor)
+        particles = dataclasses.replace(particles, actor=self._gripped(particles, actor, started))
         if self.simulator.dynamics.priors.get("segmentation") is not None:
             particles = dataclasses.replace(particles, body=_body_centers(particles, label))
         if self.plan.spec.dynamics.background == "masked_out":
@@ -137,6 +138,23 @@ class ModelScenes(Scenes):
         particles = self.state.particles
         step = self.simulator.rollout(particles, 1, self.plan, actors=acting)[0]
         self.state = ModelState(append_step(particles, step, self.plan.history), self.state.actors + moved)
+
+    @torch.no_grad()
+    def throw(self, velocities: Tensor) -> None:
+        """The older steps of the history become those of a free flight that has ``velocities`` now."""
+        particles = self.state.particles
+        table, scene = particles.clouds, particles.row_scene()
+        newest = {table.scenes[q]: table.steps[q] for q in newest_clouds(table)}
+        ages = [newest[scene] - step for scene, step in zip(table.scenes, table.steps)]
+        seconds = torch.tensor(ages, device=self.device)[particles.row_cloud(), None] / FPS
+        fall = 0.5 * torch.tensor([0.0, 0.0, -GRAVITY], device=self.device)
+        moves = (particles.activity == DYNAMIC)[:, None]
+        velocity = velocities.float()[scene]
+        means = particles.means + torch.where(moves, seconds * (fall * seconds - velocity), 0)
+        fields = {"means": means}
+        if particles.velocity is not None:
+            fields["velocity"] = torch.where(moves, (velocity - fall / FPS) / FPS, particles.velocity)
+        self.state = ModelState(dataclasses.replace(particles, **fields), self.state.actors)
 
     def actors(self) -> Tensor:
         return self.state.actors
@@ -184,6 +202,15 @@ class ModelScenes(Scenes):
         )
         labels = torch.where(frames.dynamic, labels.long() - render.FIRST_BODY, -1)
         return frames.subsample(self.inputs.background_stride, self.inputs.body_stride), labels
+
+    def _gripped(self, particles: Particles, actor: Tensor, started: Mapping[int, Start]) -> Tensor:
+        """Actor of each particle [N]; those of bodies in a gripper belong to it."""
+        for number, start in started.items():
+            for a, center in enumerate(start.scene.actors if start.scene.grip else ()):
+                away = particles.means - torch.from_numpy(center).to(particles.means)
+                held = (away.norm(dim=1) < start.scene.grip) & (particles.row_scene() == number)
+                actor = torch.where(held & (particles.activity == DYNAMIC), a, actor)
+        return actor
 
     def _merge(self, particles: Particles, started: Mapping[int, Start]) -> None:
         """Replaces the scenes ``started`` of the state by ``particles``."""

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsim3d.envs.scenes import FPS, N_PARTICLES, Scenes, TrueScene
+from gsim3d.envs.scenes import FPS, N_PARTICLES, Scenes, TrueScene, polar
 from gsim3d.envs.tasks import TaskEnv, TaskVectorEnv
 from gsim3d.synth import pushing
 from gsim3d.synth.embedding import RigidFrame
@@ -103,7 +103,7 @@ class PushToGoal(_Push):
     def draw(cls, rng: np.random.Generator) -> PushScene:
         at = rng.uniform(-0.2, 0.2, 2)
         body = pushing.draw_body(pushing.OBJECTS[rng.integers(len(pushing.OBJECTS))], at, rng.uniform(0, 2 * np.pi))
-        return PushScene([body], at + _polar(rng, PUSHER_DISTANCE), at + _polar(rng, GOAL_DISTANCE))
+        return PushScene([body], at + polar(rng, PUSHER_DISTANCE), at + polar(rng, GOAL_DISTANCE))
 
     @classmethod
     def distances(cls, scenes: Scenes, goals: Tensor) -> Tensor:
@@ -131,7 +131,7 @@ class PushClear(_Push):
             at = 0.62 * pushing.SIZE * np.array([np.cos(angle), np.sin(angle)])
             name = pushing.OBJECTS[rng.integers(len(pushing.OBJECTS))]
             bodies.append(pushing.draw_body(name, at, rng.uniform(0, 2 * np.pi)))
-        return PushScene(bodies, _polar(rng, (0.75, 0.9)), np.zeros(2))
+        return PushScene(bodies, polar(rng, (0.75, 0.9)), np.zeros(2))
 
     @classmethod
     def distances(cls, scenes: Scenes, goals: Tensor) -> Tensor:
@@ -160,8 +160,3 @@ def bounded_velocity(pusher: Tensor, velocity: Tensor) -> Tensor:
     end = pusher + velocity / FPS
     reach = end.norm(dim=-1, keepdim=True)
     return torch.where(reach <= WORKSPACE, velocity, (end * (WORKSPACE / reach) - pusher) * FPS)
-
-
-def _polar(rng: np.random.Generator, distance: tuple[float, float]) -> np.ndarray:
-    angle = rng.uniform(0, 2 * np.pi)
-    return rng.uniform(*distance) * np.array([np.cos(angle), np.sin(angle)])

@@ -31,7 +31,10 @@ class TrueScene(ABC):
         goal: [2] metres.
         surfaces: of the bodies, then of the actors.
         n_bodies: number of bodies.
+        grip: metres; particles of bodies nearer to an actor's center move with it.
     """
+
+    grip = 0.0
 
     def __init__(self, goal: np.ndarray, surfaces: Sequence[render.Surface], n_bodies: int):
         self.goal, self.surfaces, self.n_bodies = goal, list(surfaces), n_bodies
@@ -63,6 +66,10 @@ class TrueScene(ABC):
     def move(self, velocities: np.ndarray) -> None:
         """Simulates one frame, in which the actors have ``velocities`` [A, 3] in m/s."""
 
+    def throw(self, velocity: np.ndarray) -> None:
+        """Gives the body, which was held until now, a ``velocity`` [3] in m/s."""
+        raise NotImplementedError(f"{type(self).__name__} has nothing to throw")
+
     def view(self, rig: cameras.Rig) -> render.View:
         """Images of all cameras now."""
         if rig.size not in self._renderers:
@@ -85,6 +92,9 @@ class Scenes(Protocol):
 
     def move(self, velocities: Tensor) -> None:
         """Simulates one frame, in which the actors have ``velocities`` [n, A, 3] in m/s."""
+
+    def throw(self, velocities: Tensor) -> None:
+        """Gives the bodies, which were held until now, ``velocities`` [n, 3] in m/s."""
 
     def actors(self) -> Tensor:
         """Centers of the actors, float64 [n, A, 3] metres."""
@@ -123,6 +133,10 @@ class TrueScenes(Scenes):
         for scene, of_scene in zip(self.all, velocities.numpy(), strict=True):
             scene.move(of_scene)
 
+    def throw(self, velocities: Tensor) -> None:
+        for scene, velocity in zip(self.all, velocities.numpy(), strict=True):
+            scene.throw(velocity)
+
     def actors(self) -> Tensor:
         return torch.from_numpy(np.stack([scene.actors for scene in self.all]))
 
@@ -139,3 +153,9 @@ class TrueScenes(Scenes):
 def padded(centers: np.ndarray, count: int) -> np.ndarray:
     """Centers [B, 3] with rows of NaN up to ``count``."""
     return np.concatenate([centers, np.full((count - len(centers), 3), np.nan)])
+
+
+def polar(rng: np.random.Generator, distance: tuple[float, float]) -> np.ndarray:
+    """Draws a position [2] at a distance between two bounds from the origin."""
+    angle = rng.uniform(0, 2 * np.pi)
+    return rng.uniform(*distance) * np.array([np.cos(angle), np.sin(angle)])

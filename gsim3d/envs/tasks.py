@@ -82,7 +82,7 @@ class TaskEnv(gymnasium.Env):
         """
         self._episodes.act(torch.as_tensor(np.array(action, np.float64))[None])
         info = self._info()
-        return self._observe(), -float(self._episodes.distances[0]), info["is_success"], False, info
+        return self._observe(), -float(self._episodes.distances[0]), bool(self._episodes.ended[0]), False, info
 
     def render(self) -> np.ndarray | None:
         """uint8 [H, W, 3] of the first camera; None without a render mode."""
@@ -115,6 +115,11 @@ class TaskEnv(gymnasium.Env):
     @abstractmethod
     def solved(cls, distances: Tensor) -> Tensor:
         """Whether scenes at ``distances`` [n] are solved, bool [n]."""
+
+    @classmethod
+    def ended(cls, distances: Tensor) -> Tensor:
+        """Whether episodes end at ``distances`` [n], bool [n]: where they are solved."""
+        return cls.solved(distances)
 
 
 class Episodes:
@@ -209,7 +214,7 @@ class Episodes:
 
     def _measure(self) -> None:
         self.distances = self.task.distances(self.scenes, self.goals)
-        self.solved = self.task.solved(self.distances)
+        self.solved, self.ended = self.task.solved(self.distances), self.task.ended(self.distances)
 
     def observe(self) -> dict[str, Tensor]:
         """Observations [n, ...]."""
@@ -313,7 +318,7 @@ class TaskVectorEnv(VectorEnv):
         self._steps += ~over
         begun = torch.from_numpy(over).to(self.scenes.device)
         rewards = (-episodes.distances).masked_fill(begun, 0.0)
-        terminated = episodes.solved & ~begun
+        terminated = episodes.ended & ~begun
         late = self._steps >= (np.inf if self._most_steps is None else self._most_steps)
         truncated = torch.from_numpy(late).to(self.scenes.device)
         self._over = late | terminated.cpu().numpy()
