@@ -22,7 +22,7 @@ _HOME = {
     "gsim3d.presets": ("ModelConfig",),
     "gsim3d.profile.autotune": ("autotune",),
     "gsim3d.simulator": ("Prediction", "Simulator"),
-    "gsim3d.state": ("Gaussians", "Particles"),
+    "gsim3d.state": ("Actions", "Gaussians", "Particles"),
     "gsim3d.ops": (
         "CURVES",
         "KernelMap",
@@ -123,7 +123,7 @@ if TYPE_CHECKING:  # the same names for type checkers; tests/test_types.py compa
     from gsim3d.presets import ModelConfig as ModelConfig
     from gsim3d.profile.autotune import autotune as autotune
     from gsim3d.simulator import Prediction as Prediction, Simulator as Simulator
-    from gsim3d.state import Gaussians as Gaussians, Particles as Particles
+    from gsim3d.state import Actions as Actions, Gaussians as Gaussians, Particles as Particles
 
 
 def __getattr__(name: str) -> Any:

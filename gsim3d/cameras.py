@@ -19,8 +19,10 @@ class TensorRecord:
     """Base class of dataclasses of tensors, with operations on all of them."""
 
     def map(self, f: Callable[[Tensor], Tensor]) -> Self:
-        """Returns a copy with ``f`` applied to every tensor."""
-        return dataclasses.replace(self, **{k: f(v) for k, v in vars(self).items() if isinstance(v, Tensor)})
+        """Returns a copy with ``f`` applied to every tensor, also of records in it."""
+        changed = {k: f(v) for k, v in vars(self).items() if isinstance(v, Tensor)}
+        changed |= {k: v.map(f) for k, v in vars(self).items() if isinstance(v, TensorRecord)}
+        return dataclasses.replace(self, **changed)
 
     def to(self, device: str | torch.device) -> Self:
         """Returns a copy on ``device``."""
@@ -88,6 +90,7 @@ class Frames(TensorRecord):
         dynamic: bool [I, H, W], pixels of movable bodies; None: all.
         valid: bool [I, H, W], pixels with recorded values (no padding), to which losses are restricted; None: all.
         world_offset: float64 [B, 3] metres, see Particles.
+        actions: motions of actors, :class:`gsim3d.Actions`; None: no actors.
     """
 
     images: Tensor
@@ -99,10 +102,7 @@ class Frames(TensorRecord):
     dynamic: Tensor | None = None
     valid: Tensor | None = None
     world_offset: Tensor | None = None
-
-    def to(self, device: str | torch.device) -> Frames:
-        """Returns a copy on ``device``."""
-        return dataclasses.replace(super().to(device), cameras=self.cameras.to(device))
+    actions: TensorRecord | None = None
 
     def subsample(self, background_stride: int, body_stride: int) -> Frames:
         """Returns frames with subsampled masks: only every n-th row and column of pixels becomes particles.

@@ -32,7 +32,7 @@ from gsim3d.nn.point_transformer import SparseConv
 from gsim3d.numerics.report import StabilityReport, pack
 from gsim3d.ops.curve import Pyramid, PyramidCapacity
 from gsim3d.ops.raster import Rendering
-from gsim3d.state import DYNAMIC, CloudTable, Particles, keeping_constants, newest_clouds
+from gsim3d.state import DYNAMIC, Actions, CloudTable, Particles, keeping_constants, newest_clouds
 
 FACTOR = 1.25  # capacity over the observed size
 ROUNDED_PARTS = "dynamics", "renderer"  # modules whose weights are cast for autocast
@@ -186,7 +186,7 @@ class CapturedRollout:
         self._background, self._cutoff = background, cutoff
         if self._plan.spec.dynamics.sleep is not None:
             raise InputError("CapturedRollout: plan must not have dynamics.sleep, which a graph does not support")
-        prepared = simulator._prepare(state, self._plan)
+        prepared = self._with_own_actions(simulator._prepare(state, self._plan))
         self._table, self._state, self._frozen = prepared.clouds, _own(prepared), None
         self._cameras = None if cameras is None else cameras.map(torch.clone)
         self._device = prepared.means.device
@@ -228,9 +228,10 @@ class CapturedRollout:
         Raises:
             NumericalError: found in an earlier call, under the policy "raise".
         """
-        state = self._simulator._prepare(state, self._plan)
+        others = {"world_offset": state.world_offset, "actions": state.actions}
+        state = self._with_own_actions(self._simulator._prepare(state, self._plan))
         self._check(state, self._table)
-        tables, self._world_offset = state.clouds, state.world_offset
+        tables, self._others = state.clouds, others
         if self._frozen is not None:
             state = self._load_parts(self._partition(state))
         _copy(self._state, state)
@@ -281,6 +282,15 @@ class CapturedRollout:
                 drawn = {"plan": self._drawn, "cutoff": self._cutoff, "report": report}
                 renderings += [self._model._draw(step, self._cameras, self._background, **drawn) for step in steps]
         return Prediction(steps, renderings)
+
+    def _with_own_actions(self, prepared: Particles) -> Particles:
+        """Returns a state whose actions, in new memory, are those of the graph's steps; None if they are not read."""
+        if prepared.actions is None or not self._plan.spec.dynamics.actions:
+            return dataclasses.replace(prepared, actions=None)
+        oldest = dict(reversed(list(zip(prepared.clouds.scenes, prepared.clouds.steps, strict=True))))
+        first = [oldest.get(scene, 0) for scene in range(len(prepared.origin))]
+        n_steps = 2**self._simulator.config.dynamics.history_bits + self._n_steps
+        return dataclasses.replace(prepared, actions=prepared.actions.between(first, n_steps))
 
     def _partition(self, prepared: Particles) -> Partition:
         """Validates a state and splits it into movable and frozen particles."""
@@ -394,6 +404,8 @@ class CapturedRollout:
             given, shape = getattr(state, name), (table.starts[-1], *value.shape[1:])
             if given is None or given.shape != shape or given.device != value.device:
                 raise InputError(f"CapturedRollout: state.{name} must be {list(shape)} on {value.device}")
+        if _kind(state.actions) != _kind(self._state.actions):
+            raise InputError("CapturedRollout: state.actions must have as many points, of the same types, as the first")
 
     def _load(self, cameras: Cameras) -> None:
         own = self._cameras
@@ -415,7 +427,7 @@ class CapturedRollout:
             table, device = step.clouds, self._device
             numbers = [number + later[scene] for scene, number in zip(table.scenes, table.steps)]
             fields = step.row_fields() | {"origin": step.origin}
-            fields = (_clones(fields) if self._copies else fields) | {"world_offset": self._world_offset}
+            fields = (_clones(fields) if self._copies else fields) | self._others
             steps.append(step.with_clouds(CloudTable.make(table.counts, table.scenes, numbers, device), **fields))
         renderings = self._predicted.renderings
         if self._copies:
@@ -472,6 +484,13 @@ def _copy(own: Particles, given: Particles) -> None:
     for name, value in own.row_fields().items():
         value.copy_(getattr(given, name))
     own.origin.copy_(given.origin)
+    if own.actions is not None:
+        own.actions.positions.copy_(given.actions.positions)
+        own.actions.types.copy_(given.actions.types)
+
+
+def _kind(actions: Actions | None) -> tuple | None:
+    return None if actions is None else (actions.positions.shape, actions.names)
 
 
 def _clones(fields: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -501,10 +501,12 @@ class Simulator(nn.Module):
             plan, generator, geometry: see :meth:`rollout`.
             guard: validates the result.
         """
-        changes = self._changes(plan)
-        pyramid = None if geometry is None else geometry(state)
+        changes, acting = self._changes(plan), state.actions is not None and plan.spec.dynamics.actions
+        history = self.dynamics.actions.added(state, acting) if acting else state
+        pyramid = None if geometry is None else geometry(history)
         options = {"pyramid": pyramid, "background": background, "changes": changes}
-        step = self.dynamics(state, generator=generator, **options)
+        step = self.dynamics(history, generator=generator, **options)
+        step = self.dynamics.actions.removed(step) if acting else step
         newest = concatenate([last_steps(state, 1)] * self.config.dynamics.steps_per_call)
         changed = [name for name, who in changes.items() if who != "none"]
         return guard(step, previous=newest, changed=changed)

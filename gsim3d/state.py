@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from gsim3d.cameras import TensorRecord
+from gsim3d.errors import InputError
 
 DYNAMIC, FROZEN, ASLEEP = 0, 1, 2  # values of Particles.activity
 
@@ -205,6 +206,76 @@ def attributes_of(*kinds: str) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True)
+class Actions(TensorRecord):
+    """Known motions of the points of actors, such as a pusher's center or the joints of a hand, in B scenes.
+
+    A model with action particles (``model.dynamics.actions``) reads them if the plan has ``dynamics.actions`` on: to
+    predict step t + 1, it receives the positions at t and the displacements to t + 1. A point rests before its first
+    and after its last given step.
+
+    Attributes:
+        positions: float [B, T, A, 3] metres, world, finite; entry i of scene b is at step ``first[b] + i``. Gradients
+            flow to it.
+        types: int64 [B, A], index into ``names``; -1: the scene has no such point.
+        names: names of the types of points.
+        first: step of the first position of each scene; empty: 0.
+    """
+
+    positions: Tensor
+    types: Tensor
+    names: tuple[str, ...]
+    first: tuple[int, ...] = ()
+
+    @classmethod
+    def of(cls, positions: Tensor, types: Sequence[str]) -> Actions:
+        """Returns the actions of scenes whose points have the same types.
+
+        Args:
+            positions: [B, T, A, 3] metres, from step 0 of each scene.
+            types: type of each of the A points.
+
+        Raises:
+            InputError: shapes do not fit, or a position is not finite; names scene and step.
+        """
+        wanted = positions.dim() == 4 and positions.shape[1] > 0 and positions.shape[2:] == (len(types), 3)
+        if not wanted or not positions.is_floating_point():
+            got = f"{positions.dtype} {list(positions.shape)}"
+            raise InputError(f"actions: positions must be float [B, T, {len(types)}, 3]; got {got}")
+        finite = positions.detach().isfinite().flatten(2).all(2)
+        if not bool(finite.all()):
+            scene, step = (~finite).nonzero()[0].tolist()
+            raise InputError(f"actions: positions of scene {scene}, step {step} must be finite")
+        names = tuple(dict.fromkeys(types))
+        index = torch.tensor([names.index(name) for name in types], device=positions.device)
+        return cls(positions, index.expand(len(positions), -1), names)
+
+    @property
+    def n_points(self) -> int:
+        """Largest number of points of a scene, A."""
+        return self.positions.shape[2]
+
+    def at(self, clouds: CloudTable, later: int = 0) -> Tensor:
+        """Positions [Q, A, 3] at the step of each cloud, or ``later`` steps after it. Needs no device sync."""
+        first, n_steps, device = self.first or (0,) * len(self.types), self.positions.shape[1], self.positions.device
+        given = zip(clouds.scenes, clouds.steps, strict=True)
+        steps = tuple(min(max(step + later - first[scene], 0), n_steps - 1) for scene, step in given)
+        return self.positions[constant(clouds.scenes, device), constant(steps, device)]
+
+    def between(self, first: Sequence[int], n_steps: int) -> Actions:
+        """Returns the ``n_steps`` steps of each scene from its step in ``first``."""
+        scenes = range(len(first))
+        clouds = [(scene, step) for scene in scenes for step in range(first[scene], first[scene] + n_steps)]
+        table = CloudTable.make((0 for _ in clouds), *zip(*clouds, strict=True), self.positions.device)
+        positions = self.at(table).unflatten(0, (len(first), n_steps))
+        return dataclasses.replace(self, positions=positions, first=tuple(first))
+
+    def select(self, scenes: Sequence[int]) -> Actions:
+        """Returns the actions of ``scenes``, in their order."""
+        chosen, first = list(scenes), tuple(self.first[scene] for scene in scenes) if self.first else ()
+        return dataclasses.replace(self, positions=self.positions[chosen], types=self.types[chosen], first=first)
+
+
+@dataclass(frozen=True)
 class Particles(TensorRecord):
     """The state of the simulator: particles with view-independent latent features.
 
@@ -246,6 +317,7 @@ class Particles(TensorRecord):
         world_offset: float64 [B, 3] metres, translation between the coordinates of each scene's files and those of
             cameras, origin and positions, which keeps the latter small enough for float32; None: 0. Edits and files use
             the coordinates of the scene's files.
+        actions: motions of actors, which the dynamics receives as further particles; None: no actors.
         known: host copy of the cloud table; see :attr:`clouds`.
     """
 
@@ -272,6 +344,7 @@ class Particles(TensorRecord):
     rest_positions: Tensor | None = None
     body: Tensor | None = None
     world_offset: Tensor | None = None
+    actions: Actions | None = None
     known: CloudTable | None = None
 
     ROW_FIELDS = tuple(ATTRIBUTES)

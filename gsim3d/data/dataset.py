@@ -14,6 +14,7 @@ from gsim3d.cameras import Cameras, Frames
 from gsim3d.data.recording import BACKGROUND, MOVING
 from gsim3d.data.scene import Scene
 from gsim3d.errors import InputError
+from gsim3d.state import Actions
 
 FEW_SCENES = 15  # smaller data sets hold out one scene
 
@@ -108,7 +109,26 @@ def make_frames(
         dynamic=labels == MOVING if masked else None,
         valid=valid,
         world_offset=torch.from_numpy(offsets) if offsets.any() else None,
+        actions=_join_actions(scenes, steps_per_scene),
     )
+
+
+def _join_actions(scenes: Sequence[Scene], steps_per_scene: Sequence) -> Actions | None:
+    """Returns the actions at the given steps and at all later ones of each scene; None if no scene has actors."""
+    recorded = [scene.recording.actions for scene in scenes]
+    known = [actions for actions in recorded if actions is not None]
+    if not known:
+        return None
+    names = tuple(sorted({name for actions in known for name in actions.types}))
+    steps = [[*map(int, s), *range(int(s[-1]) + 1, scene.n_steps)] for s, scene in zip(steps_per_scene, scenes)]
+    shape = len(scenes), max(map(len, steps)), max(len(actions.types) for actions in known)
+    positions, types = torch.zeros(*shape, 3), torch.full((shape[0], shape[2]), -1)
+    for number, actions in enumerate(recorded):
+        if actions is not None:
+            at = steps[number] + [steps[number][-1]] * (shape[1] - len(steps[number]))
+            positions[number, :, : len(actions.types)] = torch.from_numpy(actions.positions[at])
+            types[number, : len(actions.types)] = torch.tensor([names.index(name) for name in actions.types])
+    return Actions(positions, types, names)
 
 
 def _join_valid(valid: list[Tensor | None], images: list[Tensor]) -> Tensor | None:

@@ -39,6 +39,8 @@ class DynamicsConfig(TransformerConfig):
             so that errors of shadows do not accumulate; bodies with changing latents are treated the same way. The
             weights have the same shapes for all three; use the same value for training and simulation.
         shuffle_orders: shuffles the four curves of each level in training.
+        actions: types of points of actors, each with a learned embedding (:mod:`gsim3d.dynamics.actions`). Empty: the
+            model has no action particles.
     """
 
     dynamic_latents: int = 32
@@ -56,6 +58,7 @@ class DynamicsConfig(TransformerConfig):
     priors: tuple[PriorConfig, ...] = ()
     background: str = "symmetric"
     shuffle_orders: bool = True
+    actions: tuple[str, ...] = ()
 
     def __post_init__(self):
         super().__post_init__()
@@ -74,6 +77,10 @@ class DynamicsConfig(TransformerConfig):
         check_ranges(self, position_length=(1e-6, 1e6), scale_max=(1e-6, 1e6), scale_min=(0, self.scale_max))
         check_ranges(self, max_step=(0, 1e6), max_latent_step=(0, 1e6), sh_degree=(0, 3), steps_per_call=(1, 10**5))
         check_ranges(self, dynamic_latents=(0, 10**4), static_latents=(0, 10**4))
+        if self.actions and (self.explicit or self.steps_per_call > 1):
+            raise InputError("DynamicsConfig: actions need a latent model (not explicit) of one step a call")
+        if len(set(self.actions)) != len(self.actions) or "" in self.actions:
+            raise InputError(f"DynamicsConfig: actions must be different names of types; got {list(self.actions)}")
         for prior in self.build_priors():
             self._check_prior(prior)
 
@@ -87,6 +94,7 @@ class DynamicsConfig(TransformerConfig):
             'predicts "from_newest" or "from_previous"': prior.acts and self.predicts == "absolute",
             "a latent model (not explicit)": prior.latent_only and self.explicit,
             'background "symmetric" or "relightable"': prior.reads_background and self.is_asymmetric,
+            "a model without actions": prior.acts and bool(self.actions),
         }
         for needed, lacks in needs.items():
             if lacks:

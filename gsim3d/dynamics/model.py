@@ -13,6 +13,7 @@ from torch.nn import functional as F
 
 from gsim3d import ops
 from gsim3d.cameras import Frames
+from gsim3d.dynamics.actions import ActionParticles
 from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.dynamics.frozen_context import FrozenContext
 from gsim3d.dynamics.partition import Partition
@@ -47,6 +48,7 @@ class Dynamics(nn.Module):
     Attributes:
         priors: priors in order of application.
         layout: layout of the network's inputs and outputs.
+        actions: action particles; None: the model has none.
         rounds: whether sizes of the geometry are rounded up in training; None: on a GPU only.
     """
 
@@ -58,6 +60,7 @@ class Dynamics(nn.Module):
         for prior in self.priors:
             prior.connect(config.encoder_channels[0], config.out_channels)
         self.net = PointTransformer(self.layout.in_channels, self.layout.out_channels, config, tuple(self.priors))
+        self.actions = ActionParticles(config) if config.actions else None
 
     def geometry(
         self,

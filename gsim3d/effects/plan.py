@@ -56,12 +56,14 @@ class Workload:
         frozen: frozen particles of a step.
         views: images of a step.
         pixels: pixels of an image.
+        actions: points of actors.
     """
 
     moving: int
     frozen: int
     views: int = 1
     pixels: int = 64 * 64
+    actions: int = 0
 
 
 def make_plan(spec: EffectsSpec, model: ModelConfig) -> Plan:
@@ -80,6 +82,7 @@ def make_plan(spec: EffectsSpec, model: ModelConfig) -> Plan:
         ("history", history > 1, f"{history} steps"),
         ("background", has_background, "computed once a rollout" if once else "computed in every step"),
         ("sleep", dynamics.sleep is not None, dynamics.sleep and dynamics.sleep.policy),
+        ("actions", bool(dynamics.actions), f"types: {len(dynamics.actions)}"),
         ("view_dependent", sh_degree > 0, f"degree {sh_degree}"),
         ("changing", changing, appearance.changing),
         ("frozen_appearance", n_frozen > 0 and changing, f"selections: {n_frozen}"),
@@ -99,7 +102,15 @@ def _is_asymmetric(spec: EffectsSpec, model: ModelConfig) -> bool:
 
 def _check_supported(spec: EffectsSpec, model: ModelConfig) -> None:
     dynamics, outputs = spec.dynamics, spec.outputs
+    known = model.dynamics.actions
+    unknown = [name for name in dynamics.actions if name not in known]
     refused = {
+        "dynamics.actions": (
+            bool(unknown), f"this model does not know the type {unknown[:1]}; it has {', '.join(known) or 'none'}"
+        ),
+        "dynamics.actions and dynamics.sleep": (
+            bool(dynamics.actions and dynamics.sleep), "what actors touch must not sleep; leave sleep out"
+        ),
         "dynamics.background asymmetric": (
             dynamics.background == "asymmetric" and not model.dynamics.is_asymmetric,
             "in this model frozen particles attend to all others",
@@ -136,7 +147,8 @@ def unused_parameters(plan: Plan, model: ModelConfig, names: Iterable[str]) -> t
     bits = config.history_bits if config.slots_from_newest else (plan.history - 1).bit_length()
     merged = config.pyramid_spec(bits).merged_bits()
     tables = {f"dynamics.net.encoder.{s}.merge.time_embedding" for s, n in enumerate(merged) if n == 0}
-    return tuple(name for name in names if name in tables)
+    without_actions = not plan.spec.dynamics.actions
+    return tuple(n for n in names if n in tables or without_actions and n.startswith("dynamics.actions."))
 
 
 def predicted_cost(plan: Plan, model: ModelConfig, work: Workload) -> dict[str, float]:
@@ -151,7 +163,8 @@ def predicted_cost(plan: Plan, model: ModelConfig, work: Workload) -> dict[str, 
     context = frozen if _is_asymmetric(plan.spec, model) else 0
     drawn = moving + frozen
     frozen_steps = 1 if model.dynamics.is_relightable else plan.history
-    seen = moving * plan.history + (frozen - context) * frozen_steps
+    acting = work.actions if plan.spec.dynamics.actions else 0
+    seen = (moving + acting) * plan.history + (frozen - context) * frozen_steps
     renderer, outputs = model.renderer, plan.spec.outputs
     harmonics = 3 * (plan.sh_degree + 1) ** 2 if outputs.rgb else 0
     hidden = 4 * renderer.latents

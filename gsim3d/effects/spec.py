@@ -22,7 +22,7 @@ FILE = "effects.yaml"  # in the folder of a scene or of a data set
 BACKGROUNDS = ("frozen", "masked_out", "dynamic", "asymmetric")
 CHANGING = ("all", "dynamic", "frozen", "none")
 POLICIES = ("exact", "approx")
-REMOVED = {"actions": "names", "contact": "pairs"}  # removed keys of old files -> their list, which must be empty
+REMOVED = {"contact": "pairs"}  # removed keys of old files -> their list, which must be empty
 
 
 class UnsupportedEffect(InputError):
@@ -63,11 +63,14 @@ class DynamicsEffects:
             frozen particles are removed; "dynamic": all particles may move.
         history: steps in the model's input; None: as many as the model supports.
         sleep: sleep of particles at rest; None: off.
+        actions: types of the points of actors that become action particles (:mod:`gsim3d.dynamics.actions`); empty:
+            off.
     """
 
     background: str = "frozen"
     history: int | None = None
     sleep: Sleep | None = None
+    actions: tuple[str, ...] = ()
 
     def __post_init__(self):
         _one_of("dynamics.background", self.background, BACKGROUNDS)
@@ -207,7 +210,10 @@ def _converted(values: dict[str, Any]) -> dict[str, Any]:
             old = dynamics.get(name)
             if old is not None and not (isinstance(old, dict) and not old.get(what)):
                 raise UnsupportedEffect(f"unsupported effect dynamics.{name}: no model simulates it; leave it out")
-        values = values | {"dynamics": {name: value for name, value in dynamics.items() if name not in REMOVED}}
+        dynamics = {name: value for name, value in dynamics.items() if name not in REMOVED}
+        if "actions" in dynamics and (old := dynamics["actions"]) is None or isinstance(old, dict):
+            dynamics["actions"] = list((old or {}).get("names") or ())
+        values = values | {"dynamics": dynamics}
     if isinstance(appearance := values.get("appearance"), dict) and "held" in appearance:
         if "frozen_appearance" in appearance:
             raise InputError("effects: appearance.held is the old name of frozen_appearance; leave it out")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import torch
@@ -72,7 +72,8 @@ def workload(scene: Scene, data: DataConfig) -> Workload:
     masks = torch.ones_like(frames.images[:, 0], dtype=torch.bool) if frames.masks is None else frames.masks
     moving = masks if frames.dynamic is None else masks & frames.dynamic
     n_moving = int(moving.sum())
-    return Workload(n_moving, int(masks.sum()) - n_moving, 1, scene.height * scene.width)
+    n_points = 0 if frames.actions is None else frames.actions.n_points
+    return Workload(n_moving, int(masks.sum()) - n_moving, 1, scene.height * scene.width, n_points)
 
 
 def plan_report(
@@ -94,9 +95,12 @@ def plan_report(
     largest = simulator.plan(EffectsSpec(outputs=OutputEffects(depth=True, alpha=True)))
     costs = [{k: v / 1e6 for k, v in predicted_cost(p, simulator.config, work).items()} for p in (plan, largest)]
     once = background_cost(plan, simulator.config, work)
+    free = predicted_cost(plan, simulator.config, replace(work, actions=0))["dynamics"] / 1e6
+    acting = costs[0]["dynamics"] - free
     yield "\n".join(
         ["predicted multiply-adds of one step and one image, in millions", _compared(*costs)]
         + [f"background, once per rollout: {once / 1e6:.1f}"] * (once > 0)
+        + [f"actions, in dynamics: {acting:.1f} for {work.actions} points"] * (acting > 0)
     )
     for device, measured in times.items():
         costs = [measured.predicted(own, p, simulator.config, work) for p in (plan, largest)]

@@ -8,16 +8,18 @@ from itertools import pairwise
 from pathlib import Path
 
 import safetensors
+import torch
 from safetensors.torch import load_file, save
 from torch import Tensor
 
 from gsim3d.errors import InputError, NumericalError
 from gsim3d.io.files import write_whole
 from gsim3d.numerics.validate import check_particles
-from gsim3d.state import Particles
+from gsim3d.state import Actions, Particles
 
 STATE = "state.safetensors"  # of a run
 ABOUT, VERSION = "gsim3d_particles", 1
+ACTIONS = ("positions", "types")  # tensors of Particles.actions
 
 
 def write_particles(path: str | Path, particles: Particles, model: str = "") -> None:
@@ -29,7 +31,11 @@ def write_particles(path: str | Path, particles: Particles, model: str = "") -> 
         model: hash of the checkpoint whose latents they hold.
     """
     tensors = {name: value for name, value in vars(particles).items() if isinstance(value, Tensor)}
-    about = {ABOUT: json.dumps({"version": VERSION, "model": model})}
+    facts = {"version": VERSION, "model": model}
+    if particles.actions is not None:
+        tensors |= {f"actions.{name}": getattr(particles.actions, name) for name in ACTIONS}
+        facts["actions"] = [particles.actions.names, particles.actions.first]
+    about = {ABOUT: json.dumps(facts)}
     write_whole(path, save({k: v.detach().cpu().contiguous().clone() for k, v in tensors.items()}, about))
 
 
@@ -47,6 +53,7 @@ def read_particles(path: str | Path) -> tuple[Particles, str]:
             about = json.loads((file.metadata() or {})[ABOUT])
         tensors = load_file(path)
         version, model = about["version"], about["model"]
+        actions = _actions(about, tensors)
     except (safetensors.SafetensorError, OSError, ValueError, KeyError, TypeError, RecursionError):
         raise InputError(f"{path}: not a state, which gsim3d simulate writes as {STATE}, or a damaged one") from None
     if version != VERSION:
@@ -57,7 +64,7 @@ def read_particles(path: str | Path) -> tuple[Particles, str]:
         raise InputError(f"{path}: {wrong[0][:40]} is missing or unknown: the state is damaged")
     if wrong := sorted(name for name, value in tensors.items() if value.dim() == 0):
         raise InputError(f"{path}: {wrong[0]} is a single number: the state is damaged")
-    particles = Particles(**tensors)
+    particles = Particles(**tensors, actions=actions)
     try:
         check_particles(particles, str(path), particles.dynamic_latents.dtype, {})
     except NumericalError as error:
@@ -68,3 +75,17 @@ def read_particles(path: str | Path) -> tuple[Particles, str]:
     if len(particles.origin) != 1 or not len(table) or any(b <= a for a, b in pairwise(table.steps)):
         raise InputError(f"{path}: must hold ascending steps of one scene")
     return particles, str(model)
+
+
+def _actions(about: dict, tensors: dict[str, Tensor]) -> Actions | None:
+    """Takes the actions out of the content of a file. Raises ValueError, KeyError or TypeError if they are damaged."""
+    if "actions" not in about:
+        return None
+    (names, first), (positions, types) = about["actions"], (tensors.pop(f"actions.{name}") for name in ACTIONS)
+    names, first = tuple(map(str, names)), tuple(map(int, first))
+    wanted = (1, positions.shape[1], types.shape[1], 3) if positions.dim() == 4 and types.dim() == 2 else ()
+    if tuple(positions.shape) != wanted or not bool(positions.isfinite().all()) or 0 in wanted or len(first) > 1:
+        raise ValueError("positions of actions are damaged")
+    if types.dtype != torch.int64 or not bool(((types >= -1) & (types < len(names))).all()):
+        raise ValueError("types of actions are damaged")
+    return Actions(positions, types, names, first)

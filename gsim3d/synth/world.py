@@ -229,9 +229,10 @@ class World(ABC):
         )
 
     def effects(self) -> EffectsSpec:
-        """Effects of the scenes: matte surfaces, a history of two steps, and shadows if there is a ground."""
+        """Effects of the scenes: matte surfaces, a history of two steps, shadows if there is a ground, and actors."""
+        background, acting = "frozen" if self.ground else "masked_out", tuple(dict.fromkeys(self.actors))
         return EffectsSpec(
-            DynamicsEffects("frozen" if self.ground else "masked_out", history=2),
+            DynamicsEffects(background, history=2, actions=acting),
             AppearanceEffects(view_dependent=0, changing="all" if self.ground else "dynamic"),
             outputs=OutputEffects(depth=self.depth),
         )

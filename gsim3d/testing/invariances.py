@@ -153,6 +153,7 @@ def take_scenes(frames: Frames, scenes: Sequence[int]) -> Frames:
         cloud_step=frames.cloud_step[chosen],
         origin=frames.origin[list(scenes)],
         world_offset=None if frames.world_offset is None else frames.world_offset[list(scenes)],
+        actions=frames.actions and frames.actions.select(scenes),
     )
 
 
@@ -165,6 +166,7 @@ def take_scenes_of_particles(particles: Particles, scenes: Sequence[int]) -> Par
         cloud_scene=torch.tensor(new_scene, device=particles.cloud_scene.device),
         origin=particles.origin[list(scenes)],
         world_offset=None if particles.world_offset is None else particles.world_offset[list(scenes)],
+        actions=particles.actions and particles.actions.select(scenes),
     )
 
 
@@ -236,7 +238,11 @@ def _with_positions(particles: Particles, change: Callable[[Tensor], Tensor]) ->
 
 def _moved(particles: Particles, shift: Tensor) -> Particles:
     moved = _with_positions(particles, lambda positions: positions + shift)
-    return dataclasses.replace(moved, origin=particles.origin + shift)
+    actions = particles.actions
+    if actions is not None:
+        positions = (actions.positions.double() + shift).to(actions.positions)
+        actions = dataclasses.replace(actions, positions=positions)
+    return dataclasses.replace(moved, origin=particles.origin + shift, actions=actions)
 
 
 def _states(simulator: Simulator, sample: Sample) -> Iterator[Particles]:

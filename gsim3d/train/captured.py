@@ -22,7 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from gsim3d.cameras import Frames
+from gsim3d.cameras import Frames, TensorRecord
 from gsim3d.cuda_graphs import Captured, fit, fixed_geometry, observing_geometry, of_prepared_state
 from gsim3d.dynamics import DynamicsConfig, concatenate
 from gsim3d.effects.plan import Plan
@@ -79,7 +79,9 @@ class Prepared:
         """Key of the graph: batches of equal kind can use the same one."""
         batch, table = self.batch, self.shapes.clouds
         images = len(batch.context.cameras), len(batch.targets.cameras)
-        return table.scenes, table.steps, batch.n_future, batch.cut, images
+        actions = batch.context.actions
+        points = None if actions is None else (actions.positions.shape, actions.names)
+        return table.scenes, table.steps, batch.n_future, batch.cut, images, points
 
 
 def check_capturable(config: DynamicsConfig) -> None:
@@ -224,7 +226,7 @@ class _Step:
         self.particles, self.moving = particles, moving
         self._graph = self._records = None
         batch, self._clouds = prepared.batch, prepared.kind[:2]
-        self._context, self._targets = _own(batch.context), _own(batch.targets)
+        self._context, self._targets = batch.context.map(torch.clone), batch.targets.map(torch.clone)
         self._shapes = owner.simulator.encoder.static_shapes(batch.context, particles)
         self._n_future, self._cut, self._weights = batch.n_future, batch.cut, weights.clone()
 
@@ -360,10 +362,7 @@ class _Step:
         self._weights.copy_(weights)
         batch = prepared.batch
         for own, given in ((self._context, batch.context), (self._targets, batch.targets)):
-            for mine, value in ((own, given), (own.cameras, given.cameras)):
-                for name, tensor in vars(value).items():
-                    if isinstance(tensor, Tensor) and name != "world_offset":  # nothing here reads it
-                        getattr(mine, name).copy_(tensor)
+            _copy(own, given)
 
 
 class _OfCalls:
@@ -435,5 +434,9 @@ def _without_background(state: Particles) -> Particles:
     return dataclasses.replace(state, activity=torch.where(left_out, ASLEEP, state.activity), opacities=opacities)
 
 
-def _own(frames: Frames) -> Frames:
-    return dataclasses.replace(frames.map(torch.clone), cameras=frames.cameras.map(torch.clone))
+def _copy(own: TensorRecord, given: TensorRecord) -> None:
+    for name, mine in vars(own).items():
+        if isinstance(mine, TensorRecord):
+            _copy(mine, getattr(given, name))
+        elif isinstance(mine, Tensor) and name != "world_offset":  # nothing here reads it
+            mine.copy_(getattr(given, name))

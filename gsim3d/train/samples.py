@@ -122,7 +122,10 @@ def draw_batch(
     given = [window.steps[:n_context] for window in windows]
     context = make_frames(chosen, [window.context_cams for window in windows], given)
     target_cams, steps = [window.target_cams for window in windows], [window.steps for window in windows]
-    targets = make_frames(chosen, target_cams, steps)
+    targets = dataclasses.replace(make_frames(chosen, target_cams, steps), actions=None)
+    if context.actions is not None:  # of the window, so that all batches have the same shape
+        actions = context.actions.between((0,) * len(chosen), n_context + phase.horizon)
+        context = dataclasses.replace(context, actions=actions)
     return Batch(subsampled(context, data), targets, n_context, phase.horizon, phase.cut)
 
 

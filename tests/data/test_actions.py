@@ -5,12 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gsim3d.data import Scene
+from gsim3d.data import Scene, make_frames
 from gsim3d.data.actions import FILE
 from gsim3d.data.cameras import near_zero
 from gsim3d.data.check import check_scene, describe
 from gsim3d.data.fitting import Fitting, fit
 from gsim3d.errors import InputError
+from gsim3d.train.config import DataConfig, PhaseConfig
+from gsim3d.train.samples import draw_batch, draw_windows
 from tests.data.scene_folder import write_scene
 
 STEPS, TYPES = 4, ("pusher", "gripper")
@@ -51,6 +53,28 @@ def test_actions_move_and_scale_with_the_cameras(folder):
     scale = small.near / recording.near
     assert scale < 1
     np.testing.assert_allclose(small.actions.positions, scale * recording.actions.positions)
+
+
+def test_frames_hold_the_actions_of_each_scene_from_their_first_step(tmp_path):
+    scenes = []
+    for number, types in enumerate((TYPES, TYPES[:1], None)):
+        write_scene(tmp_path / f"{number}", n_steps=STEPS)
+        if types:
+            save(tmp_path / f"{number}", positions=POSITIONS[:, : len(types)], types=np.array(types))
+        scenes.append(Scene.open(tmp_path / f"{number}"))
+    frames = make_frames(scenes, [[0]] * 3, [[0, 1], [1, 3], [2]])
+    positions, types = frames.actions.positions.numpy(), frames.actions.types.tolist()
+    assert frames.actions.names == ("gripper", "pusher") and types == [[1, 0], [1, -1], [-1, -1]]
+    np.testing.assert_array_equal(positions[0], POSITIONS)
+    np.testing.assert_array_equal(positions[1, :, 0], POSITIONS[[1, 3, 3, 3], 0])  # rests after its last step
+    assert make_frames(scenes[2:], [[0]], [[0]]).actions is None
+    phase, data = PhaseConfig(steps=1, horizon=1, batch=4, target_views=1), DataConfig(history=2, context_views=1)
+    for step in range(4):
+        batch = draw_batch(scenes[:1], data, phase, 0, step, range(4))
+        actions, windows = batch.context.actions, draw_windows(scenes[:1], data, phase, 0, step, range(4))
+        wanted = np.stack([POSITIONS[window.start : window.start + 3] for window in windows])
+        np.testing.assert_array_equal(actions.positions.numpy(), wanted)
+        assert batch.targets.actions is None and actions.types.tolist() == [[1, 0]] * 4
 
 
 LATE = POSITIONS.copy()

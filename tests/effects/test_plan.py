@@ -47,6 +47,8 @@ def test_plan_lists_priors_in_order():
 def test_old_files_with_removed_keys_load_while_they_are_off():
     off = {"actions": {"type": "keypoints3d", "names": []}, "contact": {"pairs": [], "halo": 0.05}}
     assert EffectsSpec.from_dict({"dynamics": off}) == EffectsSpec()
+    old = EffectsSpec.from_dict({"dynamics": {"actions": {"type": "keypoints3d", "names": ["hand"]}}})
+    assert old == EffectsSpec.from_dict({"dynamics": {"actions": ["hand"]}}) and old.dynamics.actions == ("hand",)
     assert EffectsSpec.from_dict({"dynamics": {"actions": None, "history": 2}}).dynamics.history == 2
 
 
@@ -60,7 +62,7 @@ def test_old_key_of_frozen_appearance_is_converted():
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"dynamics": {"actions": {"names": ["hand"]}}}, "unsupported effect dynamics.actions"),
+        ({"dynamics": {"actions": ["hand"]}}, "unsupported effect dynamics.actions: .* the type .*hand.*; it has none"),
         ({"dynamics": {"contact": {"pairs": [["a", "b"]]}}}, "unsupported effect dynamics.contact"),
         ({"dynamics": {"sleep": {"policy": "approx"}}}, "unsupported effect dynamics.sleep.policy approx"),
         ({"dynamics": {"background": "asymmetric"}}, "unsupported effect dynamics.background asymmetric"),
@@ -93,7 +95,7 @@ def test_plan_refuses_degree_beyond_model():
         ({"dynamics": {"sleep": {"policy": "soundly"}}}, "dynamics.sleep.policy must be one of exact, approx"),
         ({"dynamics": {"sleep": {"patience": 0}}}, "dynamics.sleep.patience must be an integer of at least 1; got 0"),
         ({"dynamics": {"sleep": {"eps": "small"}}}, "dynamics.sleep.eps: must be a number; got 'small'"),
-        ({"dynamics": {"actions": 3}}, "unsupported effect dynamics.actions: no model simulates it"),
+        ({"dynamics": {"actions": 3}}, "dynamics.actions: must be a list"),
         ({"outputs": {"depth": "yes"}}, "outputs.depth: must be true or false; got 'yes'"),
         ({"version": 2}, "version must be 1; got 2"),
     ],

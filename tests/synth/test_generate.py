@@ -107,7 +107,10 @@ def test_generated_effects_spec_of_each_world(made):
             settings = build_world(world, "mini", {"subset": subset, "depth": True})
             spec = settings.effects()
             assert spec.outputs.depth and (spec.dynamics.background == "masked_out") == (subset == "no-ground")
-            plan = make_plan(spec, presets.tiny())
+            model = presets.tiny()
+            dynamics = dataclasses.replace(model.dynamics, actions=spec.dynamics.actions)
+            plan = make_plan(spec, dataclasses.replace(model, dynamics=dynamics))
+            assert spec.dynamics.actions == tuple(dict.fromkeys(settings.actors))
             assert plan.history == 2 and ("background" in plan.on) == settings.ground
 
 

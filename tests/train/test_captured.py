@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import json
 
+import numpy as np
 import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -36,7 +37,11 @@ TOLERANCE = {"cpu": 1e-4, "cuda": 1e-3}
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory):
-    return [Scene.open(path) for path in find_scenes(write_scenes(tmp_path_factory.mktemp("scenes"), 2))]
+    folders = find_scenes(write_scenes(tmp_path_factory.mktemp("scenes"), 2))
+    for number, folder in enumerate(folders):
+        positions = np.random.default_rng(number).uniform(-0.3, 0.3, (6, 2, 3)).astype(np.float32)
+        np.savez(folder / "actions.npz", positions=positions, types=["hand", "pusher"][:: 1 - 2 * number])
+    return [Scene.open(path) for path in folders]
 
 
 MOVING = dataclasses.replace(
@@ -84,8 +89,14 @@ ALL_MOVING = dataclasses.replace(
     model={"dynamics": {"priors": [{"type": "velocity_from_images"}, {"type": "inertia"}, {"type": "shape_matching"}]}},
     effects={"dynamics": {"background": "dynamic"}},
 )
+ACTING = dataclasses.replace(
+    CONFIG,
+    model={"dynamics": {"actions": ["hand", "pusher"], "background": "relightable"}},
+    effects={"dynamics": {"actions": ["hand", "pusher"]}},
+)
 KINDS = {
     "latent": CONFIG,
+    "acting": ACTING,
     "all moving": ALL_MOVING,
     "moving": MOVING,
     "relightable": RELIGHTABLE,
@@ -144,8 +155,12 @@ def run(captured, batch, trainer, report=None, factor=1.0):
         ({}, "all moving"),
         ({"horizon": 3, "cut": 2}, "relightable"),
         ({"horizon": 3, "cut": 2}, "flying"),
+        ({"horizon": 3, "cut": 2}, "acting"),
     ],
-    ids=["rollout", "encoded", "explicit", "masked", "moving", "moving, masked", "all moving", "relightable", "flying"],
+    ids=[
+        *("rollout", "encoded", "explicit", "masked", "moving", "moving, masked", "all moving", "relightable"),
+        *("flying", "acting"),
+    ],
     indirect=["trainer"],
 )
 def test_captured_gradients_equal_autograd(phase, scenes, trainer, device):
@@ -293,7 +308,10 @@ class Ops(TorchDispatchMode):
 
 @pytest.mark.parametrize(
     "row",
-    ["latent", "explicit", "no-tem", "background-masked", "background-dynamic", "calls-2", "relightable", "flying"],
+    [
+        *("latent", "explicit", "no-tem", "background-masked", "background-dynamic", "calls-2", "relightable"),
+        *("flying", "acting"),
+    ],
 )
 def test_captured_ops_have_fixed_sizes(row, scenes, tmp_path):
     config = KINDS[row] if row in KINDS else changed(CONFIG, ROWS[row].change)

@@ -140,6 +140,7 @@ class Encoder(nn.Module):
             activity=activity,
             origin=frames.origin,
             world_offset=frames.world_offset,
+            actions=frames.actions,
             known=known,
         )
 
@@ -193,6 +194,7 @@ class Encoder(nn.Module):
             activity=activity if kept is None else activity[index],
             origin=frames.origin,
             world_offset=frames.world_offset,
+            actions=frames.actions,
         )
 
 

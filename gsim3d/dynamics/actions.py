@@ -1,0 +1,112 @@
+"""Action particles: the points of actors as further particles in the input of the dynamics.
+
+In the input of the step from t to t + 1, each cloud has one particle for each point: at the point's position at the
+cloud's step, with latents
+
+    e[type] + W d / grid_size
+
+of its learned embedding e and its displacement d to the next step, which is known also for the newest cloud. What the
+network predicts for action particles is not used.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from gsim3d.dynamics.config import DynamicsConfig
+from gsim3d.errors import InputError
+from gsim3d.state import (
+    ASLEEP,
+    DYNAMIC,
+    Actions,
+    CloudTable,
+    Particles,
+    constant,
+    split_rows,
+    take_runs,
+    with_same_attributes,
+)
+
+INITIAL = 0.5  # standard deviation of the initial weights
+
+
+class ActionParticles(nn.Module):
+    """Adds the points of actors to a history, and removes them from the step that was predicted from it.
+
+    Attributes:
+        embedding: latents of each type [n_types, channels], dynamic ones first.
+        displacement: latents [3, channels] of a displacement of one cell along each axis.
+    """
+
+    def __init__(self, config: DynamicsConfig):
+        super().__init__()
+        self.types, self.cell, self.n_dynamic = config.actions, config.grid_size, config.dynamic_latents
+        channels = config.dynamic_latents + config.static_latents
+        self.embedding = nn.Parameter(torch.empty(len(self.types), channels).normal_(std=INITIAL))
+        self.displacement = nn.Parameter(torch.empty(3, channels).normal_(std=INITIAL))
+
+    def added(self, history: Particles, acting: tuple[str, ...]) -> Particles:
+        """Returns ``history`` with the action particles of each cloud after its other particles.
+
+        Args:
+            history: clouds of scenes with actions.
+            acting: types of the points to add.
+
+        Raises:
+            InputError: the actions are of fewer scenes, or of a type that the model does not know.
+        """
+        points = self._points(history, acting)
+        given, points = with_same_attributes([history, points])
+        tables = given.clouds, points.clouds
+        runs = [[table.row_runs([q])[0] for q in range(len(table))] for table in tables]
+        fields = {}
+        for name, value in given.row_fields().items():
+            pieces = zip(split_rows(value, runs[0]), split_rows(getattr(points, name), runs[1]), strict=True)
+            fields[name] = torch.cat([piece for both in pieces for piece in both])
+        counts = (own + more for own, more in zip(tables[0].counts, tables[1].counts, strict=True))
+        table = CloudTable.make(counts, tables[0].scenes, tables[0].steps, history.cu_rows.device)
+        return given.with_clouds(table, **fields)
+
+    @staticmethod
+    def removed(step: Particles) -> Particles:
+        """Returns ``step`` without its action particles."""
+        table, n_points = step.clouds, step.actions.n_points
+        runs = [(begin, until - n_points) for begin, until in zip(table.starts, table.starts[1:], strict=False)]
+        fields = {name: take_runs(value, runs) for name, value in step.row_fields().items()}
+        counts = (until - begin for begin, until in runs)
+        return step.with_clouds(CloudTable.make(counts, table.scenes, table.steps, step.cu_rows.device), **fields)
+
+    def _points(self, history: Particles, acting: tuple[str, ...]) -> Particles:
+        """The action particles of all clouds; those that a scene does not have are asleep."""
+        actions, table, like = history.actions, history.clouds, history.means
+        if len(actions.types) != len(history.origin):
+            raise InputError(f"actions: must be of {len(history.origin)} scenes; got {len(actions.types)}")
+        types = self._types(actions, acting)[constant(table.scenes, like.device)]
+        now = actions.at(table).to(like)
+        moved = ((actions.at(table, 1).to(like) - now) / self.cell)[..., None]
+        latents = self.embedding[types.clamp_min(0)] + (moved * self.displacement).sum(-2)
+        latents = latents.flatten(0, 1).to(history.dynamic_latents)
+        counts = CloudTable.make((actions.n_points,) * len(table), table.scenes, table.steps, history.cu_rows.device)
+        cu_rows, scene, step = counts.tensors
+        return Particles(
+            means=now.flatten(0, 1),
+            opacities=torch.ones_like(latents[:, 0]),
+            dynamic_latents=latents[:, : self.n_dynamic],
+            static_latents=latents[:, self.n_dynamic :],
+            cu_rows=cu_rows,
+            cloud_scene=scene,
+            cloud_step=step,
+            activity=torch.where(types.flatten() < 0, ASLEEP, DYNAMIC).to(torch.uint8),
+            origin=history.origin,
+            known=counts,
+        )
+
+    def _types(self, actions: Actions, acting: tuple[str, ...]) -> Tensor:
+        """int64 [B, A]: index into ``types`` of each point; -1: not there, or not acting."""
+        if unknown := [name for name in actions.names if name not in self.types]:
+            raise InputError(
+                f"actions: the model does not know the type {unknown[0]!r}; it has {', '.join(self.types)}"
+            )
+        index = tuple(self.types.index(name) if name in acting else -1 for name in actions.names)
+        return constant((*index, -1), actions.types.device)[actions.types]  # -1 reads the last entry
