@@ -20,9 +20,9 @@ class TensorRecord:
 
     def map(self, f: Callable[[Tensor], Tensor]) -> Self:
         """Returns a copy with ``f`` applied to every tensor, also of records in it."""
-        changed = {k: f(v) for k, v in vars(self).items() if isinstance(v, Tensor)}
-        changed |= {k: v.map(f) for k, v in vars(self).items() if isinstance(v, TensorRecord)}
-        return dataclasses.replace(self, **changed)
+        tensors = {k: f(v) for k, v in vars(self).items() if isinstance(v, Tensor)}
+        records = {k: v.map(f) for k, v in vars(self).items() if isinstance(v, TensorRecord)}
+        return dataclasses.replace(self, **tensors, **records)
 
     def to(self, device: str | torch.device) -> Self:
         """Returns a copy on ``device``."""

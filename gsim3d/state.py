@@ -255,7 +255,7 @@ class Actions(TensorRecord):
         return self.positions.shape[2]
 
     def at(self, clouds: CloudTable, later: int = 0) -> Tensor:
-        """Positions [Q, A, 3] at the step of each cloud, or ``later`` steps after it. Needs no device sync."""
+        """Returns positions [Q, A, 3], ``later`` steps after the step of each of ``clouds``. Needs no device sync."""
         first, n_steps, device = self.first or (0,) * len(self.types), self.positions.shape[1], self.positions.device
         given = zip(clouds.scenes, clouds.steps, strict=True)
         steps = tuple(min(max(step + later - first[scene], 0), n_steps - 1) for scene, step in given)
@@ -263,9 +263,9 @@ class Actions(TensorRecord):
 
     def between(self, first: Sequence[int], n_steps: int) -> Actions:
         """Returns the ``n_steps`` steps of each scene from its step in ``first``."""
-        scenes = range(len(first))
-        clouds = [(scene, step) for scene in scenes for step in range(first[scene], first[scene] + n_steps)]
-        table = CloudTable.make((0 for _ in clouds), *zip(*clouds, strict=True), self.positions.device)
+        scenes = [scene for scene in range(len(first)) for _ in range(n_steps)]
+        steps = [begin + step for begin in first for step in range(n_steps)]
+        table = CloudTable.make((0 for _ in scenes), scenes, steps, self.positions.device)
         positions = self.at(table).unflatten(0, (len(first), n_steps))
         return dataclasses.replace(self, positions=positions, first=tuple(first))
 
