@@ -6,6 +6,7 @@ import math
 import threading
 import time
 import types
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -83,6 +84,37 @@ def test_store_batches_equal_those_of_scene_folders(world, spread, tmp_path):
                 assert torch.equal(getattr(a.cameras, name), getattr(b.cameras, name)), (part, name)
 
 
+def test_push_recipe_trains_on_a_store_with_actions(tmp_path):
+    """As tools/release/train.py does, with small images and the preset tiny; batches equal those of scene folders."""
+    options = {"image_size": 32, "n_frames": 7, "n_trajectories": 2, "n_cams": 8}
+    made = dataclasses.replace(recipe("push"), options=options)
+    world, store = made.stream(), TrajectoryStore(made.stream(), 2, "cpu")
+    for number, scene in enumerate(world.scenes()):
+        store.put(**np.load(write_trajectory(world, scene, str(tmp_path / f"{number}.npz"))))
+    options |= {"preset": made.preset, "seed": world.seed}
+    folders = generate(tmp_path / "data", "push", processes=1, progress=False, **options).folders
+    acting = {"model": {"dynamics": {"actions": ["pusher"]}}, "effects": made.train.effects}
+    config = dataclasses.replace(CONFIG, **acting)
+    given, wanted = (
+        draw(config.data, config.phases[1], 5, 3, range(3))
+        for draw in (store.draw, partial(draw_batch, [Scene.open(folder) for folder in folders]))
+    )
+    assert given.context.actions.names == wanted.context.actions.names == ("pusher",)
+    for name in ("positions", "types"):
+        assert torch.equal(getattr(given.context.actions, name), getattr(wanted.context.actions, name))
+    assert torch.equal(given.context.images, wanted.context.images) and given.targets.actions is None
+    trainer = RunTrainer(config, store, tmp_path / "run", "cpu")
+    trainer.begin_run(time.monotonic() + 60)
+    before = trainer.simulator.dynamics.actions.embedding.detach().clone()
+    entries = [trainer.train_step() for _ in range(4)]
+    assert not any("skipped" in entry for entry in entries)
+    assert (trainer.simulator.dynamics.actions.embedding != before).any()
+    save_state(trainer, tmp_path / "state", "push-pure", Progress())
+    other = RunTrainer(config, store, tmp_path / "again", "cpu")
+    load_into(other, tmp_path / "state", "push-pure")
+    assert other.step == 4 and restore(weights_file(tmp_path / "state", "push-pure")).plan.spec.dynamics.actions
+
+
 def test_store_replaces_oldest_trajectories(store, trajectories):
     darker = trajectories[0]["images"] // 2
     store.put(**{**trajectories[0], "images": darker})
@@ -111,7 +143,7 @@ def test_error_of_a_data_worker_is_raised(world, tmp_path):
 class Painted:
     """Cameras of a world whose videos are painted, not simulated."""
 
-    n_frames, size, fps = 6, 32, 24.0
+    n_frames, size, fps, actors = 6, 32, 24.0, ()
 
     def rig(self):
         return two_rings(12, self.size, 1.5, 5.0, distance=3.2, target_height=0.7, elevations=(18.0, 42.0), fov=42.0)
@@ -309,6 +341,10 @@ def test_the_next_run_has_the_capacity_that_graphs_needed(store, tmp_path):
 @pytest.mark.parametrize("arm", ["pure", "positions", "priors"])
 @pytest.mark.parametrize("world", WORLDS)
 def test_recipes_are_sound(world, arm):
+    if (world, arm) == ("push", "priors"):
+        with pytest.raises(InputError, match="the world push has no priors"):
+            recipe(world, arm)
+        return
     made = recipe(world, arm)
     stream, data, phases = made.stream(), made.train.data, made.train.phases
     assert made.name == f"{world}-{arm}" and stream.name == world and made.n_first <= made.capacity
@@ -319,6 +355,8 @@ def test_recipes_are_sound(world, arm):
     hand_made = model.position_features, "inertia" in kinds, "contact" in kinds
     expected = {"pure": (0, 0, 0), "positions": (1, 0, 0), "priors": (1, 1, world != "cloth")}
     assert hand_made == expected[arm]
+    acting = made.train.effects.get("dynamics", {}).get("actions", [])
+    assert model.actions == tuple(acting) == stream.effects().dynamics.actions
 
 
 @pytest.mark.parametrize("world, arm", [("water", "pure"), ("elastic", "magic")])

@@ -15,7 +15,7 @@ from gsim3d.synth.worlds import VALIDATION_SEED, build_world
 from gsim3d.train.config import TrainConfig
 
 CONFIGS = Path(__file__).resolve().parent.parent.parent / "configs" / "train"
-WORLDS = ("elastic", "cloth", "rigid")
+WORLDS = ("elastic", "cloth", "rigid", "push")
 SEED = 20261126  # of the training stream; `gsim3d generate` without --seed makes other trajectories
 
 
@@ -57,7 +57,7 @@ def recipe(world: str, arm: str = "pure") -> Recipe:
     """The recipe of ``arm`` in ``world``.
 
     Raises:
-        InputError: there is no such world or arm.
+        InputError: there is no such world or arm, or the world has no priors.
     """
     arms = read_yaml(CONFIGS / "arms.yaml")
     for given, known in ((world, WORLDS), (arm, arms)):
@@ -67,6 +67,8 @@ def recipe(world: str, arm: str = "pure") -> Recipe:
     for part in ("all", world):
         settings = merged(settings, arms[arm].get(part, {}))
     if arm == "priors":
+        if not (CONFIGS.parent / "priors" / f"{world}.yaml").is_file():
+            raise InputError(f"the world {world} has no priors; choose another arm")
         settings = merged(settings, {"model": {"dynamics": read_yaml(CONFIGS.parent / "priors" / f"{world}.yaml")}})
     return Recipe(f"{world}-{arm}", world, from_dict(TrainConfig, settings))
 

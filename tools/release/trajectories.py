@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import multiprocessing
 import os
 import shutil
@@ -19,6 +20,7 @@ import torch
 from gsim3d.cameras import Cameras, Frames
 from gsim3d.data import Window, generator
 from gsim3d.data.recording import BACKGROUND, MOVING
+from gsim3d.state import Actions
 from gsim3d.synth.cameras import Rig, workspace_origin
 from gsim3d.synth.run import start_data_worker, write_trajectory
 from gsim3d.synth.world import World
@@ -77,6 +79,10 @@ class TrajectoryStore:
         self._viewmats = torch.zeros(capacity, rig.n_cams, 4, 4, device=device)
         self._Ks = torch.zeros(capacity, rig.n_cams, 3, 3, device=device)
         self._origins = torch.zeros(capacity, 3, dtype=torch.float64, device=device)
+        self._names, n_points = tuple(sorted(set(world.actors))), len(world.actors)
+        self._actions = torch.zeros(capacity, world.n_frames, n_points, 3, device=device)
+        self._types = torch.full((capacity, n_points), -1, device=device)
+        self._type_of = torch.tensor([self._names.index(name) for name in world.actors], device=device)
         self._near, self._far = rig.near, rig.far
         self.lock = threading.RLock()  # held while trajectories come or are read
         self.trajectories = [
@@ -84,7 +90,7 @@ class TrajectoryStore:
             for slot in range(capacity)
         ]
 
-    def put(self, images: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray) -> None:
+    def put(self, images: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray, actions: np.ndarray | None = None) -> None:
         """Stores a trajectory, as :func:`gsim3d.synth.run.write_trajectory` writes it."""
         rig = Rig(viewmats, Ks, images.shape[2], self._near, self._far)
         with self.lock:
@@ -92,6 +98,11 @@ class TrajectoryStore:
             stored = (self._videos, images), (self._viewmats, viewmats), (self._Ks, Ks)
             for whole, values in (*stored, (self._origins, workspace_origin(rig))):
                 whole[slot].copy_(torch.from_numpy(values))
+            if actions is not None:
+                n_points = actions.shape[1]
+                self._actions[slot, :, :n_points].copy_(torch.from_numpy(actions))
+                self._types[slot] = -1
+                self._types[slot, :n_points] = self._type_of[:n_points]
             self.count += 1
 
     def draw(self, data: DataConfig, phase: PhaseConfig, seed: int, step: int, samples: Sequence[int]) -> Batch:
@@ -103,7 +114,16 @@ class TrajectoryStore:
             frames = partial(self._frames, windows, data.near_far or (self._near, self._far))
             context = frames([window.context_cams for window in windows], range(n_context))
             targets = frames([window.target_cams for window in windows], range(n_context + phase.horizon))
+            context = dataclasses.replace(context, actions=self._acting(windows))
         return Batch(subsampled(context, data), targets, n_context, phase.horizon, phase.cut)
+
+    def _acting(self, windows: Sequence[Window]) -> Actions | None:
+        """The actions of the windows; None: the world has no actors."""
+        if not self._names:
+            return None
+        slots = torch.tensor([window.scene.slot for window in windows], device=self.device)
+        steps = torch.tensor([window.steps for window in windows], device=self.device)
+        return Actions(self._actions[slots[:, None], steps], self._types[slots], self._names)
 
     def _frames(self, windows: Sequence[Window], depths: tuple[float, float], cams: Sequence, steps: range) -> Frames:
         """Some steps of the windows, seen by the cameras of each step."""
