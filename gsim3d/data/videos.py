@@ -59,7 +59,8 @@ def read(folder: Path, problems: Problems) -> Recording:
     sizes = {name: entry.size("size") for name, entry in entries.items()}
     sources = {name: _frames_of(folder, name, sizes[name], source, problems) for name in names}
     fps, resample = description.positive("fps"), description.positive("resample")
-    numbers, rate, notes = _steps(sources, fps, resample, source, problems)
+    offsets = {name: _offset(entry) for name, entry in entries.items()}
+    numbers, rate, notes = _steps(sources, offsets, fps, resample, source, problems)
     unit, center = _unit(description), _pixel_center(description)
     cameras = [_camera(entry, name, sizes[name], len(numbers[0]), unit, center) for name, entry in entries.items()]
     masks = _masks(folder, description, list(sources.values()))
@@ -109,6 +110,12 @@ def _entries(description: Description) -> dict[str, Description]:
             raise InputError(f"{description.where}two cameras have the same name: {name}")
         found[name] = Description(entry, f"{description.where}camera {name}: ", description.problems)
     return found
+
+
+def _offset(entry: Description) -> float:
+    """Returns the seconds to add to a camera's times."""
+    found = array(entry.values.get("offset", 0), [()], f"{entry.where}offset", entry.problems)
+    return 0.0 if found is None else float(found)
 
 
 def _unit(description: Description) -> float:
@@ -195,7 +202,12 @@ def _frames_of(folder: Path, name: str, size: tuple[int, int], source: Path, pro
 
 
 def _steps(
-    sources: dict[str, _Frames | Video], fps: float | None, resample: float | None, source: Path, problems: Problems
+    sources: dict[str, _Frames | Video],
+    offsets: dict[str, float],
+    fps: float | None,
+    resample: float | None,
+    source: Path,
+    problems: Problems,
 ) -> tuple[list[list[int]], float, list[str]]:
     """Synchronises the cameras: returns frame numbers of each camera by step, steps per second, and notes."""
     videos = {name: frames for name, frames in sources.items() if isinstance(frames, Video) and frames.numbers}
@@ -224,13 +236,13 @@ def _steps(
             problems.add(f"{source}: fps is {fps:g}, but the videos have {own_rate:g} frames per second")
         notes.append(f"the frame rate of the videos, {own_rate:g} per second, is replaced by fps: {fps:g}")
     if resample is not None:
-        numbers, more = _resampled({**folders, **videos}, fps, resample, source)
+        numbers, more = _resampled({**folders, **videos}, offsets, fps, resample, source)
         n_steps = max(map(len, numbers.values()), default=1)
         return [numbers.get(name, [0] * n_steps) for name in sources], resample, notes + more
     rate = fps or own_rate or 1.0
-    first = {name: round(video.times[0] * (video.rate or 0)) for name, video in videos.items()}
-    ticks = {name: [first[name] + number for number in video.numbers] for name, video in videos.items()}
-    ticks = {name: ticks.get(name) or sources[name].numbers for name in sources if sources[name].numbers}
+    first = {name: round((video.times[0] + offsets[name]) * (video.rate or 0)) for name, video in videos.items()}
+    first |= {name: round(offsets[name] * rate) for name in folders}
+    ticks = {name: [first[name] + number for number in sources[name].numbers] for name in sources if name in first}
     if any(first.values()):
         low, high = max(own[0] for own in ticks.values()), min(own[-1] for own in ticks.values())
         longest = max(map(len, ticks.values()))
@@ -246,7 +258,7 @@ def _steps(
 
 
 def _resampled(
-    sources: dict[str, _Frames | Video], fps: float | None, rate: float, source: Path
+    sources: dict[str, _Frames | Video], offsets: dict[str, float], fps: float | None, rate: float, source: Path
 ) -> tuple[dict[str, list[int]], list[str]]:
     """Resamples to ``rate`` steps per second over the common time: the nearest frame of each camera at each step."""
     if not sources:
@@ -254,7 +266,8 @@ def _resampled(
     times = {}
     for name, frames in sources.items():
         own = frames.times if isinstance(frames, Video) else np.array(frames.numbers) / fps
-        times[name] = own * frames.rate / fps if fps and isinstance(frames, Video) and frames.rate else own
+        own = own * frames.rate / fps if fps and isinstance(frames, Video) and frames.rate else own
+        times[name] = own + offsets[name]
     low, high = max(own[0] for own in times.values()), min(own[-1] for own in times.values())
     count = math.floor((high - low) * rate + 1e-6) + 1 if high >= low else 0
     if count < 1:

@@ -1,0 +1,247 @@
+"""Calibration from films of a ChArUco board: intrinsics of each camera, then all poses by bundle adjustment.
+
+Pixel centres are OpenCV's (integers). The board's axes are OpenCV's too: x along its rows, y down, z into the paper.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gsim3d.capture.films import Film
+from gsim3d.data.recording import evenly_spaced
+from gsim3d.errors import InputError, did_you_mean
+
+MAX_VIEWS = 60  # times at which the board is searched
+MIN_CORNERS = 8  # of a view that is used
+MIN_VIEWS = 5  # of each camera
+ITERATIONS = 30
+LOSS_SCALE = 2.0  # pixels; larger residuals are weighted down (Huber)
+MARKER_SHARE = 0.75  # of the square
+OUT_OF_PAPER = np.diag([1.0, -1.0, -1.0])  # axes of a board -> world axes, with z out of the printed side
+
+
+@dataclass(frozen=True)
+class Board:
+    """A ChArUco board.
+
+    Attributes:
+        columns: squares along x.
+        rows: squares along y.
+        square: side of a square in metres.
+        marker: side of a marker in metres; 0: 0.75 squares.
+        dictionary: OpenCV's name of the markers, such as "4X4_50".
+    """
+
+    columns: int
+    rows: int
+    square: float
+    marker: float = 0.0
+    dictionary: str = "4X4_50"
+
+    def made(self):
+        """Returns the board as an object of OpenCV; raises InputError if its measures are invalid."""
+        import cv2
+
+        known = [name.removeprefix("DICT_") for name in dir(cv2.aruco) if name.startswith("DICT_")]
+        if self.dictionary not in known:
+            raise InputError(
+                f"--dictionary: {self.dictionary!r} is none of OpenCV's{did_you_mean(self.dictionary, known)}"
+            )
+        marker = self.marker or MARKER_SHARE * self.square
+        if min(self.columns, self.rows) < 3 or not 0 < marker < self.square:
+            raise InputError(f"--board: needs 3 squares or more a side, and markers smaller than squares; got {self}")
+        markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}"))
+        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, marker, markers)
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """A calibrated camera.
+
+    Attributes:
+        name: camera.
+        size: (width, height) in pixels.
+        K: [3, 3], pixels.
+        distortion: OpenCV's k1 k2 p1 p2 k3.
+        viewmat: [4, 4], world-to-camera, metres.
+        error: root mean squared reprojection error in pixels.
+        views: number of images that it rests on.
+    """
+
+    name: str
+    size: tuple[int, int]
+    K: np.ndarray
+    distortion: np.ndarray
+    viewmat: np.ndarray
+    error: float
+    views: int
+
+
+@dataclass
+class _Views:
+    """Detections of one camera: frame -> (object points [N, 1, 3], pixels [N, 1, 2], pose of the board in the camera)."""
+
+    found: dict[int, tuple] = field(default_factory=dict)
+    K: np.ndarray = None
+    distortion: np.ndarray = None
+
+
+def calibrate_board(films: Sequence[Film], offsets: Sequence[float], board: Board) -> list[Calibrated]:
+    """Calibrates cameras by a board that is moved before them, or several of them see at rest.
+
+    The world is the board where most cameras see it at once, the last time that they do: x along its rows, z out of
+    the printed side.
+
+    Args:
+        films: films of the board.
+        offsets: seconds to add to the times of each film.
+        board: what they show.
+
+    Raises:
+        InputError: a camera sees the board too rarely, or never at the same time as the others.
+    """
+    views = [_intrinsics(film, found) for film, found in zip(films, _detect(films, offsets, board), strict=True)]
+    cameras = _initial_poses([film.name for film in films], views)
+    frames = sorted(set().union(*(v.found for v in views)))
+    boards = {}
+    for frame in frames:
+        cam = max((c for c, v in enumerate(views) if frame in v.found), key=lambda c: len(views[c].found[frame][0]))
+        boards[frame] = np.linalg.inv(cameras[cam]) @ views[cam].found[frame][2]
+    cameras, boards, residuals = _adjust(views, cameras, boards)
+    seen = {frame: sum(frame in v.found for v in views) for frame in frames}
+    world = boards[max(frames, key=lambda frame: (seen[frame], frame))]
+    turn = np.eye(4)
+    turn[:3, :3] = OUT_OF_PAPER
+    errors = [float(np.sqrt(np.square(np.concatenate(own)).sum(-1).mean())) for own in residuals]
+    return [
+        Calibrated(film.name, film.size, v.K, v.distortion, camera @ world @ turn, error, len(v.found))
+        for film, v, camera, error in zip(films, views, cameras, errors, strict=True)
+    ]
+
+
+def _detect(films: Sequence[Film], offsets: Sequence[float], board: Board) -> list[dict[int, tuple]]:
+    """Returns (object points, pixels) of the board by time, for each camera."""
+    import cv2
+
+    made = board.made()
+    detector = cv2.aruco.CharucoDetector(made)
+    spans = [film.video.times[[0, -1]] + offset for film, offset in zip(films, offsets, strict=True)]
+    low, high = max(span[0] for span in spans), min(span[1] for span in spans)
+    if low >= high:
+        raise InputError(f"{films[0].video.what}: the films of the board have no time in common")
+    times, every = films[0].video.times + offsets[0], []
+    times = times[(times >= low - 1e-6) & (times <= high + 1e-6)]
+    times = times[evenly_spaced(len(times), MAX_VIEWS)]
+    for film, offset in zip(films, offsets, strict=True):
+        numbers, found = film.nearest(times - offset), {}
+        for frame, image in enumerate(film.grey(numbers)):
+            corners, ids, *_ = detector.detectBoard(image)
+            if ids is not None and len(ids) >= MIN_CORNERS:
+                found[frame] = made.matchImagePoints(corners, ids)
+        every.append(found)
+    return every
+
+
+def _intrinsics(film: Film, found: dict[int, tuple]) -> _Views:
+    import cv2
+
+    if len(found) < MIN_VIEWS:
+        raise InputError(
+            f"camera {film.name}: the board is recognised in {len(found)} images; at least {MIN_VIEWS} are needed, close "
+            "up, tilted and in the corners (are --board and --dictionary those of the print?)"
+        )
+    points, pixels = zip(*found.values(), strict=True)
+    _, K, distortion, turns, shifts = cv2.calibrateCamera(
+        points, pixels, film.size, None, None, flags=cv2.CALIB_FIX_K3
+    )
+    poses = (_matrix(turn, shift) for turn, shift in zip(turns, shifts, strict=True))
+    views = {frame: (*given, pose) for (frame, given), pose in zip(found.items(), poses, strict=True)}
+    return _Views(views, K, distortion.reshape(-1)[:5])
+
+
+def _initial_poses(names: Sequence[str], views: Sequence[_Views]) -> list[np.ndarray]:
+    """Returns camera poses [4, 4] relative to the first, along the pairs that share most views of the board."""
+    shared = {(a, b): sorted(set(views[a].found) & set(views[b].found)) for a in range(len(views)) for b in range(a)}
+    poses: dict[int, np.ndarray] = {0: np.eye(4)}
+    while len(poses) < len(views):
+        pairs = [(len(frames), pair) for pair, frames in shared.items() if sum(c in poses for c in pair) == 1]
+        count, pair = max(pairs, default=(0, ()))
+        if count == 0:
+            lost = ", ".join(name for cam, name in enumerate(names) if cam not in poses)
+            raise InputError(f"camera {lost}: never sees the board at the same time as camera {names[0]} or its others")
+        known, new = sorted(pair, key=lambda cam: cam not in poses)
+        steps = [views[new].found[f][2] @ np.linalg.inv(views[known].found[f][2]) for f in shared[pair]]
+        middle = np.median([step[:3, 3] for step in steps], 0)  # of the relative positions: robust to wrong poses
+        poses[new] = min(steps, key=lambda step: np.linalg.norm(step[:3, 3] - middle)) @ poses[known]
+    return [poses[cam] for cam in range(len(views))]
+
+
+def _adjust(views, cameras, boards):
+    """Minimises the reprojection errors over poses of cameras (but the first) and boards, by Levenberg-Marquardt."""
+    frames = list(boards)
+    where = {("cam", c): 6 * (c - 1) for c in range(1, len(views))}
+    where |= {("board", f): 6 * (len(views) - 1 + i) for i, f in enumerate(frames)}
+    x = np.zeros(6 * (len(views) - 1 + len(frames)))
+    for (kind, key), at in where.items():
+        x[at : at + 6] = _vector(cameras[key] if kind == "cam" else boards[key])
+    damping, best = 1e-3, None
+    for _ in range(ITERATIONS):
+        cost, normal, slope, residuals = _linearised(x, views, where) if best is None else best
+        best = cost, normal, slope, residuals
+        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-9), -slope)
+        tried = _linearised(x + step, views, where)
+        if tried[0] < cost:
+            x, best, damping = x + step, tried, damping / 5
+            if cost - tried[0] < 1e-9 * cost:
+                break
+        else:
+            damping *= 5
+    cameras = [np.eye(4)] + [_matrix(*np.split(x[6 * c : 6 * c + 6], 2)) for c in range(len(views) - 1)]
+    boards = {f: _matrix(*np.split(x[where["board", f] :][:6], 2)) for f in frames}
+    return cameras, boards, best[3]
+
+
+def _linearised(x, views, where):
+    """Returns cost, normal matrix and slope of the robust squared errors, and the residuals of each camera."""
+    import cv2
+
+    normal, slope, cost, residuals = np.zeros((len(x), len(x))), np.zeros(len(x)), 0.0, []
+    for cam, own in enumerate(views):
+        residuals.append([])
+        at_cam = where.get(("cam", cam))
+        turn, shift = (np.zeros(3), np.zeros(3)) if at_cam is None else np.split(x[at_cam : at_cam + 6], 2)
+        for frame, (points, pixels, _) in own.found.items():
+            at = where["board", frame]
+            turn3, shift3, *d = cv2.composeRT(*np.split(x[at : at + 6], 2), turn, shift)
+            projected, jacobian = cv2.projectPoints(points, turn3, shift3, own.K, own.distortion)[:2]
+            off = projected.reshape(-1, 2) - pixels.reshape(-1, 2)
+            size = np.linalg.norm(off, axis=1)
+            weight = np.repeat(np.minimum(1, LOSS_SCALE / np.maximum(size, 1e-12)), 2)
+            cost += np.where(size < LOSS_SCALE, size**2, 2 * LOSS_SCALE * size - LOSS_SCALE**2).sum()
+            of_turn, of_shift = jacobian[:, :3], jacobian[:, 3:6]
+            for_board = np.hstack([of_turn @ d[0] + of_shift @ d[4], of_turn @ d[1] + of_shift @ d[5]])
+            for_cam = np.hstack([of_turn @ d[2] + of_shift @ d[6], of_turn @ d[3] + of_shift @ d[7]])
+            parts = [(at, for_board)] + ([] if at_cam is None else [(at_cam, for_cam)])
+            for begin, J in parts:
+                slope[begin : begin + 6] += J.T @ (weight * off.ravel())
+                for other, J2 in parts:
+                    normal[begin : begin + 6, other : other + 6] += J.T @ (weight[:, None] * J2)
+            residuals[-1].append(off)
+    return cost, normal, slope, residuals
+
+
+def _matrix(turn, shift) -> np.ndarray:
+    import cv2
+
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(np.asarray(turn))[0], np.ravel(shift)
+    return pose
+
+
+def _vector(pose: np.ndarray) -> np.ndarray:
+    import cv2
+
+    return np.concatenate([cv2.Rodrigues(pose[:3, :3])[0].ravel(), pose[:3, 3]])

@@ -1,0 +1,127 @@
+"""Implementation of ``gsim3d calibrate``: writes cameras.json of every take of a capture."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from gsim3d.capture.board import Board, Calibrated, calibrate_board
+from gsim3d.capture.films import BOARD, MIN_AGREEMENT, Film, films_in, motion, takes_of, time_offsets
+from gsim3d.capture.sfm import calibrate_sfm
+from gsim3d.data.videos import FILE
+from gsim3d.errors import InputError
+from gsim3d.io.files import write_whole
+
+MAX_ERROR = 1 / 400  # of the image width: largest reprojection error of a calibration that fits
+
+
+def calibrate(
+    folder: str | Path,
+    *,
+    board: Board | None = None,
+    scale: tuple[str, str, float] | None = None,
+    force: bool = False,
+    say: Callable[[str], None] = print,
+) -> list[Path]:
+    """Calibrates the films in ``folder`` and writes cameras.json beside the films of each take.
+
+    Args:
+        folder: films <camera>.mp4, or one folder of films for each take; films of the board lie in ``folder``/board,
+            or else the films of the first take show it.
+        board: the board; None: structure from motion.
+        scale: two cameras and the distance between them in metres.
+        force: write cameras that do not fit, too.
+        say: receives what was decided, and why.
+
+    Returns:
+        The files written.
+
+    Raises:
+        InputError: no films, too few detections, unconnected cameras, or a reprojection error above MAX_ERROR.
+    """
+    folder = Path(folder)
+    takes = takes_of(folder)
+    shown = films_in(folder / BOARD) or next(iter(takes.values()))
+    films = [Film.open(file) for file in shown]
+    names = [film.name for film in films]
+    if wrong := set(names) ^ {file.stem for file in next(iter(takes.values()))}:
+        raise InputError(f"{folder / BOARD}: must have one film of each camera; {', '.join(sorted(wrong))} differ")
+    if board is None:
+        say(f"calibrate: structure from motion of {len(films)} median images, because no --board is given")
+        cameras = calibrate_sfm(films)
+    else:
+        offsets, _ = _offsets(films, say)
+        cameras = calibrate_board(films, offsets, board)
+    for camera in cameras:
+        say(f"  {camera.name}: reprojection error {camera.error:.2f} px, {camera.views} images")
+    _check_fit(cameras, folder, force)
+    cameras = _scaled(cameras, scale, board is not None, say)
+    written = []
+    for take, files in takes.items():
+        films = films if files == shown else [Film.open(file) for file in files]
+        for film, camera in zip(films, cameras, strict=True):
+            if film.size != camera.size:
+                raise InputError(f"{film.video.what}: has {film.size} pixels, the film of the board {camera.size}")
+        say(f"{take}:")
+        offsets, agreement = _offsets(films, say)
+        written.append(take / FILE)
+        write_whole(take / FILE, _description(cameras, offsets, agreement, "board" if board else "sfm"))
+    say(f"calibrate: wrote {', '.join(map(str, written))}")
+    return written
+
+
+def _offsets(films: Sequence[Film], say: Callable[[str], None]) -> tuple[np.ndarray, np.ndarray]:
+    offsets, agreement = time_offsets([film.video.times for film in films], [motion(film) for film in films])
+    for film, offset, own in zip(films, offsets, agreement, strict=True):
+        why = f"motion correlates by {own:.2f}"
+        if own < MIN_AGREEMENT:
+            why += f", below {MIN_AGREEMENT}: the times in the file are kept; clap once in view of all cameras"
+        say(f"  {film.name}: {1000 * offset:+.0f} ms ({why})")
+    return offsets, agreement
+
+
+def _check_fit(cameras: Sequence[Calibrated], folder: Path, force: bool) -> None:
+    bad = [camera for camera in cameras if camera.error > MAX_ERROR * camera.size[0]]
+    if bad and not force:
+        errors = ", ".join(f"{c.name} {c.error:.2f} px (at most {MAX_ERROR * c.size[0]:.2f})" for c in bad)
+        raise InputError(
+            f"{folder}: the calibration does not fit: reprojection error of {errors}; film the board again, sharper and "
+            "closer, with cameras that do not move (--force goes on)"
+        )
+
+
+def _scaled(cameras: list[Calibrated], scale, metric: bool, say) -> list[Calibrated]:
+    if scale is None:
+        if not metric:
+            say("  no --scale: lengths are in units of the mean distance of the cameras, not in metres")
+        return cameras
+    centres = {c.name: -c.viewmat[:3, :3].T @ c.viewmat[:3, 3] for c in cameras}
+    first, second, metres = scale
+    if first == second or not {first, second} <= set(centres):
+        raise InputError(f"--scale: {first}:{second} must be two of the cameras {', '.join(centres)}")
+    share = metres / float(np.linalg.norm(centres[first] - centres[second]))
+    say(f"  scale: {first} and {second} are {metres:g} m apart, lengths are multiplied by {share:.4g}")
+    step = np.array([1.0, 1.0, 1.0, share])
+    return [dataclasses.replace(c, viewmat=np.vstack([c.viewmat[:3] * step, c.viewmat[3:]])) for c in cameras]
+
+
+def _description(cameras: Sequence[Calibrated], offsets, agreement, method: str) -> str:
+    entries = [
+        {
+            "name": camera.name,
+            "size": list(camera.size),
+            "K": camera.K.tolist(),
+            "R": camera.viewmat[:3, :3].tolist(),
+            "T": camera.viewmat[:3, 3].tolist(),
+            "distortion": camera.distortion.tolist(),
+            "offset": round(float(offset), 6),
+            "calibration": {"error": camera.error, "images": camera.views, "motion_agreement": float(own)},
+        }
+        for camera, offset, own in zip(cameras, offsets, agreement, strict=True)
+    ]
+    content = {"pixel_center": 0, "calibrated_by": method, "cameras": entries}
+    return json.dumps(content, indent=1) + "\n"
