@@ -44,7 +44,7 @@ RINGS = {
         synth
         evaluate envs
         testing
-        profile
+        profile capture
     """,
     "commands": """
         cli.arguments

@@ -82,7 +82,7 @@ class Calibrated:
 
 @dataclass
 class _Views:
-    """Detections of one camera: frame -> (object points [N, 1, 3], pixels [N, 1, 2], pose of the board in the camera)."""
+    """Detections of one camera: frame -> (object points [N, 1, 3], pixels [N, 1, 2], board -> camera)."""
 
     found: dict[int, tuple] = field(default_factory=dict)
     K: np.ndarray = None
@@ -150,13 +150,11 @@ def _intrinsics(film: Film, found: dict[int, tuple]) -> _Views:
 
     if len(found) < MIN_VIEWS:
         raise InputError(
-            f"camera {film.name}: the board is recognised in {len(found)} images; at least {MIN_VIEWS} are needed, close "
-            "up, tilted and in the corners (are --board and --dictionary those of the print?)"
+            f"camera {film.name}: the board is recognised in {len(found)} images; at least {MIN_VIEWS} are needed, "
+            "close up, tilted and in the corners (are --board and --dictionary those of the print?)"
         )
     points, pixels = zip(*found.values(), strict=True)
-    _, K, distortion, turns, shifts = cv2.calibrateCamera(
-        points, pixels, film.size, None, None, flags=cv2.CALIB_FIX_K3
-    )
+    _, K, distortion, turns, shifts = cv2.calibrateCamera(points, pixels, film.size, None, None, flags=cv2.CALIB_FIX_K3)
     poses = (_matrix(turn, shift) for turn, shift in zip(turns, shifts, strict=True))
     views = {frame: (*given, pose) for (frame, given), pose in zip(found.items(), poses, strict=True)}
     return _Views(views, K, distortion.reshape(-1)[:5])

@@ -89,8 +89,8 @@ def _check_fit(cameras: Sequence[Calibrated], folder: Path, force: bool) -> None
     if bad and not force:
         errors = ", ".join(f"{c.name} {c.error:.2f} px (at most {MAX_ERROR * c.size[0]:.2f})" for c in bad)
         raise InputError(
-            f"{folder}: the calibration does not fit: reprojection error of {errors}; film the board again, sharper and "
-            "closer, with cameras that do not move (--force goes on)"
+            f"{folder}: the calibration does not fit: reprojection error of {errors}; film the board again, sharper "
+            "and closer, with cameras that do not move (--force goes on)"
         )
 
 

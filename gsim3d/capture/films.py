@@ -19,6 +19,8 @@ MOTION_WIDTH = 160  # pixels, of the images in which motion is measured
 MAX_LAG = 10.0  # seconds; films that start further apart cannot be aligned
 MIN_OVERLAP = 0.5  # of the shorter film, at any tested lag
 MIN_AGREEMENT = 0.5  # correlation of the motion in two films
+MIN_VARIATION = 0.1  # of the motion, over its mean; films that show less are not aligned
+MIN_FRAMES = 16
 GRID = 4  # samples of the motion a frame
 
 
@@ -125,10 +127,13 @@ def time_offsets(times: Sequence[np.ndarray], motions: Sequence[np.ndarray]) -> 
         middle = (own[1:] + own[:-1]) / 2
         grid = np.arange(middle[0], middle[-1], step)
         signals.append((middle[0], np.interp(grid, middle, np.log1p(values))))
+    varied = [len(own) >= MIN_FRAMES and own.std() > MIN_VARIATION * own.mean() for own in motions]
     rows, lags, weights, best = [], [], [], np.zeros(n)
     for a in range(n):
         for b in range(a + 1, n):
-            shift, agreement = _lag(signals[a][1], signals[b][1], round(MAX_LAG / step))
+            shift, agreement = (
+                _lag(signals[a][1], signals[b][1], round(MAX_LAG / step)) if varied[a] & varied[b] else (0, 0)
+            )
             best[[a, b]] = np.maximum(best[[a, b]], agreement)
             if agreement >= MIN_AGREEMENT:
                 rows.append((np.arange(n) == b) * 1.0 - (np.arange(n) == a))

@@ -39,25 +39,32 @@ def calibrate_sfm(films: Sequence[Film]) -> list[Calibrated]:
         images, database = Path(temporary) / "images", Path(temporary) / "features.db"
         images.mkdir()
         for film in films:
-            background = median_image(lambda steps: np.stack([*film.video.read(steps, Problems())]), len(film.video.times))
+            background = median_image(
+                lambda steps: np.stack([*film.video.read(steps, Problems())]), len(film.video.times)
+            )
             cv2.imwrite(str(images / f"{film.name}.png"), background[..., ::-1])
         pycolmap.logging.minloglevel = pycolmap.logging.ERROR
         options = pycolmap.IncrementalPipelineOptions()
         options.min_model_size, options.mapper.init_min_num_inliers = 2, 30
         pycolmap.set_random_seed(0)
         pycolmap.extract_features(
-            database, images, camera_mode=pycolmap.CameraMode.PER_IMAGE, reader_options={"camera_model": "SIMPLE_RADIAL"}
+            database,
+            images,
+            camera_mode=pycolmap.CameraMode.PER_IMAGE,
+            reader_options={"camera_model": "SIMPLE_RADIAL"},
         )
         pycolmap.match_exhaustive(database)
         models = pycolmap.incremental_mapping(database, images, temporary, options)
     found = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
-    registered = {} if found is None else {Path(image.name).stem: image for image in found.images.values() if image.has_pose}
+    registered = (
+        {} if found is None else {Path(image.name).stem: image for image in found.images.values() if image.has_pose}
+    )
     lost = [film.name for film in films if film.name not in registered]
     if lost:
         raise InputError(
-            f"structure from motion connects {len(registered)} of {len(films)} cameras, without {', '.join(lost)}: their "
-            "images share too few features; move the cameras closer together, add texture to the scene, or film a board "
-            "(--board)"
+            f"structure from motion connects {len(registered)} of {len(films)} cameras, without {', '.join(lost)}: "
+            "their images share too few features; move the cameras closer together, add texture to the scene, or film "
+            "a board (--board)"
         )
     viewmats = np.stack([_viewmat(registered[film.name]) for film in films])
     viewmats = _upright(viewmats)

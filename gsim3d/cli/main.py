@@ -18,6 +18,8 @@ COMMANDS = {
     "generate": ("gsim3d.cli.generate", "make a data set: multi-view video of simulated bodies that fall"),
     "bound": ("gsim3d.cli.bound", "the scores that a perfect simulator has on a generated data set"),
     "check-data": ("gsim3d.cli.check_data", "what is wrong with recorded scenes, and a picture of their cameras"),
+    "calibrate": ("gsim3d.cli.calibrate", "cameras of own films, from a ChArUco board or structure from motion"),
+    "capture": ("gsim3d.cli.capture", "from own films to a simulator: calibrate, check, prepare, train, score"),
     "train": ("gsim3d.cli.train", "learn a simulator from a data set"),
     "simulate": ("gsim3d.cli.simulate", "predict the future of one scene: video and .ply"),
     "export": ("gsim3d.cli.export", "write 3D Gaussians for other tools: .spz, .splat, .glb, USD, a video"),

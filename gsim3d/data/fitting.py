@@ -150,8 +150,8 @@ def _of_size(recording: Recording, size: tuple[int, int], how: Fitting) -> Recor
         recording,
         Ks=Ks,
         sizes=tuple(sizes),
-        read_images=changed(recording.read_images, _scale_colors),
-        read_labels=None if recording.read_labels is None else changed(recording.read_labels, _scale_labels),
+        read_images=changed(recording.read_images, scale_colors),
+        read_labels=None if recording.read_labels is None else changed(recording.read_labels, scale_labels),
     )
 
 
@@ -159,13 +159,13 @@ def _smooth(maps: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
     return F.interpolate(maps[None], size[::-1], mode="bilinear", antialias=True)[0]
 
 
-def _scale_colors(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def scale_colors(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Resizes uint8 [h, w, 3], bilinear with antialiasing."""
     scaled = _smooth(torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1).float(), size)
     return scaled.round().clamp(0, 255).to(torch.uint8).permute(1, 2, 0).numpy()
 
 
-def _scale_labels(labels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def scale_labels(labels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Resizes labels uint8 [h, w]: MOVING if any source pixel is, BACKGROUND only if all source pixels are."""
     parts = torch.from_numpy(np.stack([labels != BACKGROUND, labels == MOVING])).float()
     shown, moving = _smooth(parts, size) > 0

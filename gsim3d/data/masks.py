@@ -15,6 +15,8 @@ MIN_DIFFERENCE = 18.0  # ... and its minimum, of 255
 BLUR = 1.2  # pixels, sigma of the Gaussian that suppresses noise and JPEG blocks
 CLOSE_SHARE = 0.012  # radius of the morphological closing, as a fraction of the image height
 MIN_AREA = 0.001  # fraction of the image; smaller components are removed
+OUTLINE = 2  # pixels on either side of the border of a component
+OUTLINE_FACTOR = 1.5  # by which the background's gradient exceeds the image's along the outline of a ghost
 MAX_HOLE = 0.005  # fraction of the image; smaller holes are filled
 
 
@@ -29,6 +31,43 @@ def median_image(read: Callable[[Sequence[int]], np.ndarray], n_steps: int) -> n
     frames = read(steps)
     middle = len(steps) // 2
     return np.partition(frames, middle, axis=0)[middle]
+
+
+def background_image(read: Callable[[Sequence[int]], np.ndarray], n_steps: int) -> np.ndarray:
+    """Estimates the background as :func:`median_image` does, without bodies that rest during most of the film.
+
+    Such a body is part of the median, and its place is marked as foreground once it leaves. There the median has the
+    outline of a body and the image has none: these pixels are replaced by their median over such images.
+
+    Arguments and result as :func:`median_image`.
+    """
+    steps = evenly_spaced(n_steps, MEDIAN_STEPS)
+    background, frames = median_image(read, n_steps), read(steps)
+    uncovered = np.stack([_ghosts(frame, background) for frame in frames])
+    for y, x in np.argwhere(uncovered.any(0)):
+        seen = frames[uncovered[:, y, x], y, x]
+        background[y, x] = np.partition(seen, len(seen) // 2, axis=0)[len(seen) // 2]
+    return background
+
+
+def _ghosts(image: np.ndarray, background: np.ndarray) -> np.ndarray:
+    """Returns bool [h, w]: components of the foreground whose outline is in ``background``, not in ``image``."""
+    import cv2
+
+    mask = foreground(image, background).astype(np.uint8)
+    edges = []
+    for picture in (image, background):
+        grey = cv2.GaussianBlur(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (0, 0), BLUR).astype(np.float32)
+        edges.append(np.hypot(cv2.Sobel(grey, -1, 1, 0), cv2.Sobel(grey, -1, 0, 1)))
+    n_parts, parts = cv2.connectedComponents(mask, connectivity=8)
+    wide = np.ones((2 * OUTLINE + 1,) * 2, np.uint8)
+    outline = np.where(cv2.dilate(mask, wide) > cv2.erode(mask, wide), 1, 0).astype(np.uint8)
+    nearest = cv2.dilate(parts.astype(np.float32), wide).astype(int)
+    ghosts = np.zeros(n_parts, bool)
+    for part in range(1, n_parts):
+        on = (nearest == part) & (outline > 0)
+        ghosts[part] = on.any() and edges[1][on].mean() > OUTLINE_FACTOR * edges[0][on].mean()
+    return ghosts[parts]
 
 
 def foreground(image: np.ndarray, background: np.ndarray) -> np.ndarray:

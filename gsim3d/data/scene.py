@@ -17,7 +17,7 @@ from gsim3d.data.cameras import check_directions, frusta_origin, near_zero, shar
 from gsim3d.data.fitting import Fitting, fit, own_depths, resample
 from gsim3d.data.images import ImageCache
 from gsim3d.data.lenses import Undistorter
-from gsim3d.data.masks import foreground, median_image
+from gsim3d.data.masks import background_image, foreground
 from gsim3d.data.recording import BACKGROUND, MOVING, Problems, ReadImages, Recording
 from gsim3d.errors import InputError
 
@@ -260,7 +260,7 @@ class Scene:
             return self._images.get(wanted, [cam])[:, 0, :height, :width]
 
         if cam not in self._medians:
-            self._medians[cam] = median_image(read, self.n_steps)
+            self._medians[cam] = background_image(read, self.n_steps)
         valid = self.valid([cam], [0])
         for step in steps:
             labels = self._padded(foreground(read([step])[0], self._medians[cam]).astype(np.uint8) * MOVING)

@@ -39,7 +39,7 @@ VIDEO_SUFFIXES = (".mp4", ".mkv", ".webm", ".mov", ".avi")
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 DISTORTIONS = [(4,), (5,), (8,)]
 OWN_FOLDERS = ("masks", "labels")  # reserved, not camera names
-CONVERT = {"labels": as_labels, "masks": as_mask, "alpha": as_opaque}
+CONVERT = {"labels": as_labels, "alpha": as_opaque}  # others are masks
 SAME_RATE = 5e-3  # relative; 29.97 and 30 fps count as equal
 MAX_RESAMPLING = 100  # steps per recorded frame of resampled videos
 MAX_DRIFT = 0.5  # frames; largest drift between videos of nearly equal rates
@@ -65,14 +65,14 @@ def read(folder: Path, problems: Problems) -> Recording:
     cameras = [_camera(entry, name, sizes[name], len(numbers[0]), unit, center) for name, entry in entries.items()]
     masks = _masks(folder, description, list(sources.values()))
     labels = sources if masks == "alpha" else None
-    if masks in OWN_FOLDERS:
+    if masks not in ("alpha", "subtract", "none"):
         labels = {name: _Frames(folder, Path(masks) / name, name, sizes[name]) for name in names}
 
     def read_images(cam: int, steps: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:
         return sources[names[cam]].read([numbers[cam][step] for step in steps], problems)
 
     def read_labels(cam: int, steps: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:
-        return labels[names[cam]].read([numbers[cam][step] for step in steps], problems, CONVERT[masks])
+        return labels[names[cam]].read([numbers[cam][step] for step in steps], problems, CONVERT.get(masks, as_mask))
 
     found = Recording.of_cameras(
         cameras,
@@ -175,10 +175,14 @@ def _lens(camera: Description) -> Lens | None:
 
 
 def _masks(folder: Path, description: Description, sources: list[_Frames | Video]) -> str:
-    """Returns the source of labels: the folder "labels" or "masks", "alpha", "subtract" or "none"."""
+    """Returns the source of labels: "labels" or another folder (of masks), "alpha", "subtract" or "none"."""
     wanted = description.values.get("masks", "subtract")
     if wanted not in ("subtract", "none"):
-        raise InputError(f'{description.where}masks must be "subtract" or "none"; got {wanted!r}')
+        if not isinstance(wanted, str) or not inside(folder, wanted, f"{description.where}masks").is_dir():
+            raise InputError(
+                f'{description.where}masks must be "subtract", "none" or a folder beside it; got {wanted!r:.80}'
+            )
+        return wanted
     if wanted == "none":
         return wanted
     own = next((name for name in reversed(OWN_FOLDERS) if (folder / name).is_dir()), None)

@@ -35,6 +35,7 @@ from gsim3d.ops.curve import Pyramid
 from gsim3d.simulator import Simulator
 from gsim3d.state import ASLEEP, DYNAMIC, Particles
 from gsim3d.train.gradients import in_segments, recomputing
+from gsim3d.train.left_out import draw_left_out, images_per_cloud, with_views
 from gsim3d.train.samples import Batch
 
 FACTOR = 1.5  # geometry capacity over the observed size; smaller causes more captures, larger makes steps slower
@@ -100,6 +101,7 @@ class CapturedLoss:
         loss: function (images [I, H, W, 3], targets, weights of the steps) -> loss and errors by step.
         precision: function that returns the autocast context of a part ("encoder", "dynamics", "renderer").
         recompute: see TrainConfig.
+        leaves_out: see ``leave_one_out`` of DataConfig.
 
     Attributes:
         parameters: all parameters of the simulator, in the order of the gradients returned.
@@ -118,10 +120,11 @@ class CapturedLoss:
         loss: Callable[[Tensor, Frames, Tensor], tuple[Tensor, Tensor]],
         precision: Callable[[str], torch.autocast],
         recompute: Collection[str] = (),
+        leaves_out: bool = False,
     ):
         check_capturable(simulator.config.dynamics)
         self.simulator, self.plan, self.loss, self.precision = simulator, plan, loss, precision
-        self.again = recomputing(recompute, simulator)
+        self.again, self.leaves_out = recomputing(recompute, simulator), leaves_out
         self.parameters = list(simulator.parameters())
         self.alone: AbstractContextManager = nullcontext()
         self.meanwhile: Callable[[], None] = lambda: None
@@ -263,7 +266,8 @@ class _Step:
         owner = self._owner
         with owner.precision("encoder"):
             encode = partial(owner.simulator.encode, shapes=self._shapes, report=report)
-            return owner.again("encoder")(encode)(self._context)
+            state = owner.again("encoder")(encode)(self._context)
+        return with_views(state, self._context, self._shapes) if owner.leaves_out else state
 
     def _rollout(
         self,
@@ -300,8 +304,11 @@ class _Step:
         particles = concatenate([state, *self._rollout(state, geometry, report, with_own_weights)])
         with owner.precision("renderer"):
             shown = {"plan": owner.plan, "report": report, "on_invalid": "drop"}
-            draw = owner.again("images")(lambda p: owner.simulator._draw(p, self._targets.cameras, **shown).color)
-            images = draw(particles)
+            draw = owner.again("images")(lambda p, cameras: owner.simulator._draw(p, cameras, **shown).color)
+            if owner.leaves_out:
+                images = draw_left_out(draw, particles, self._targets.cameras, images_per_cloud(self._context))
+            else:
+                images = draw(particles, self._targets.cameras)
         report.close()  # recomputation in the backward pass must not count again
         loss, errors = owner.loss(images, self._targets, self._weights)
         once = [*owner.simulator.encoder.parameters(), *owner.simulator.renderer.parameters()]

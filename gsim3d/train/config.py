@@ -84,6 +84,9 @@ class DataConfig:
         targets_apart: draw targets only from cameras that are not an input of the window. Otherwise a model can overfit
             to input views with tiny particles right in front of each camera.
         unit_cameras: divide lengths by the largest coordinate of a scene's cameras.
+        leave_one_out: targets are the input images, each drawn from the particles of the other cameras; for captures
+            with few cameras. ``target_views`` has no effect.
+        subsample_fps: take every k-th frame of a scene, so that it has this rate; 0: all frames.
     """
 
     history: int = 2
@@ -99,6 +102,8 @@ class DataConfig:
     near_far: tuple[float, ...] = ()
     targets_apart: bool = False
     unit_cameras: bool = False
+    leave_one_out: bool = False
+    subsample_fps: float = 0.0
 
     RENAMED: ClassVar[dict] = {"thawed": "unfrozen_background"}
 
@@ -106,6 +111,9 @@ class DataConfig:
         check_ranges(self, history=(1, 10**5), shortest_history=(0, 10**5), unfrozen_background=(0, 1))
         check_ranges(self, context_views=(1, 10**4), fewest_views=(0, 10**4))
         check_ranges(self, background_stride=(1, LARGEST_SIDE), body_stride=(1, LARGEST_SIDE))
+        check_ranges(self, subsample_fps=(0, 1e6))
+        if self.leave_one_out and (min(self.fewest_views or 2, self.context_views) < 2 or self.targets_apart):
+            raise InputError("data.leave_one_out: needs two input views or more, and targets_apart: false")
         for least, most in (("shortest_history", "history"), ("fewest_views", "context_views")):
             if getattr(self, least) > getattr(self, most):
                 raise InputError(
@@ -136,12 +144,15 @@ class LossConfig:
         body_weight: weight added to pixels of movable bodies; other pixels have weight 1.
         perceptual: weight of LPIPS (VGG), added to the squared error; 0.05 in the paper, 0.01 for its rigid bodies.
             Install its weights with `gsim3d weights lpips`.
+        image_gain: multiply the colour channels of each predicted image by the gains from 2/3 to 3/2 that fit its
+            target best, for cameras that differ in exposure or white balance.
     """
 
     balance: float = 0.5
     discount: float = 0.87
     body_weight: float = 0.0
     perceptual: float = 0.0
+    image_gain: bool = False
 
     REMOVED: ClassVar[dict] = {"bodies": 0, "shape": 0, "shape_length": ...}
 

@@ -38,6 +38,7 @@ from gsim3d.train.gradients import (
     recomputing,
     total_norm,
 )
+from gsim3d.train.left_out import draw_left_out, images_per_cloud, with_views
 from gsim3d.train.log import (
     Log,
     Sample,
@@ -121,7 +122,8 @@ class Trainer:
 
     def _capture(self) -> CapturedLoss:
         precision = partial(self.config.precision.of, device=self.device)
-        return CapturedLoss(self.simulator, self.plan, self.loss_of_images, precision, self.config.recompute)
+        parts = self.config.recompute, self.config.data.leave_one_out
+        return CapturedLoss(self.simulator, self.plan, self.loss_of_images, precision, *parts)
 
     # ---- the loop ----
 
@@ -389,6 +391,8 @@ class Trainer:
 
         with precision.of("encoder", self.device):
             particles = again("encoder")(lambda context: simulator.encode(context, **options))(batch.context)
+        if self.config.data.leave_one_out:
+            particles = with_views(particles, batch.context)
         watch.count(particles.n_rows, particles.n_clouds)
         if batch.n_future:
             if self.config.data.unfrozen_background:
@@ -403,7 +407,11 @@ class Trainer:
             particles = concatenate([particles, *steps])
         draw = {"plan": self.plan, **options}
         with precision.of("renderer", self.device):
-            images = again("images")(lambda p: simulator.render(p, batch.targets.cameras, **draw).color)(particles)
+            render = again("images")(lambda p, cameras: simulator.render(p, cameras, **draw).color)
+            if self.config.data.leave_one_out:
+                images = draw_left_out(render, particles, batch.targets.cameras, images_per_cloud(batch.context))
+            else:
+                images = render(particles, batch.targets.cameras)
         watch.report.close()  # recomputation in the backward pass must not count again
         return images
 

@@ -9,6 +9,7 @@ from gsim3d.cameras import Frames
 from gsim3d.evaluate.perceptual.lpips import LPIPS
 from gsim3d.train.config import LossConfig
 
+MAX_GAIN = 1.5
 LEAST_WEIGHT = 1e-12  # lower bound of the total pixel weight of an image, so that empty images have error 0
 
 
@@ -28,6 +29,8 @@ def training_loss(
     weight = 1 + settings.body_weight * shown if settings.body_weight and shown is not None else None
     if targets.valid is not None:
         weight = targets.valid.float() if weight is None else weight * targets.valid
+    if settings.image_gain:
+        images = images * fitted_gain(images.detach(), truth, weight)
     step = targets.cameras.image_cloud % n_steps
     wrong = image_errors(images, truth, weight)
     if perceptual is not None:
@@ -61,6 +64,14 @@ def image_errors(pred: Tensor, target: Tensor, weight: Tensor | None = None) -> 
     if weight is None:
         return errors.mean((1, 2))
     return (errors * weight).sum((1, 2)) / weight.sum((1, 2)).clamp(min=LEAST_WEIGHT)
+
+
+def fitted_gain(pred: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
+    """Returns the gains [I, 1, 1, C] of images [I, H, W, C], from 1 / MAX_GAIN to MAX_GAIN, with the least error."""
+    weight = 1 if weight is None else weight[..., None]
+    power = (weight * pred * pred).sum((1, 2), keepdim=True)
+    gain = (weight * pred * target).sum((1, 2), keepdim=True) / power.clamp(min=LEAST_WEIGHT)
+    return torch.where(power > 0, gain, 1).clamp(1 / MAX_GAIN, MAX_GAIN)
 
 
 def mean_by_step(values: Tensor, step: Tensor, n_steps: int) -> Tensor:

@@ -90,7 +90,7 @@ class Restored:
             fitting = dataclasses.replace(fitting, near_far=None)
         if resample and self.fps is None:
             raise InputError("--resample: the checkpoint does not contain the frame rate of its training")
-        scene = Scene.open(folder, fitting=fitting, fps=self.fps if resample else None)
+        scene = Scene.open(folder, fitting=fitting, fps=self.fps if resample or self.data.subsample_fps else None)
         self.check_scene(scene)
         if scene.recording.notes:
             warnings.warn(f"{folder}: {'; '.join(scene.recording.notes)}", FitWarning, stacklevel=2)

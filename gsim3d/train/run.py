@@ -53,7 +53,8 @@ def train(
     """
     if cache:
         Path(cache).mkdir(parents=True, exist_ok=True)  # raises early if not writable
-    scenes = [Scene.open(folder, cache_dir=cache, fitting=config.data.fitting) for folder in folders]
+    opened = {"fitting": config.data.fitting, "fps": config.data.subsample_fps or None}
+    scenes = [Scene.open(folder, cache_dir=cache, **opened) for folder in folders]
     Path(out).mkdir(parents=True, exist_ok=True)
     with joined(device) as processes, only_one_writer(Path(out)) if processes.is_first else nullcontext():
         report = print if processes.is_first else lambda *_: None
@@ -63,7 +64,7 @@ def train(
             report(f"resuming at step {trainer.step} of {config.n_steps}{changed}")
         watched = None
         if viewer and held_out:
-            watched = Scene.open(held_out[0], cache_dir=cache, fitting=config.data.fitting)
+            watched = Scene.open(held_out[0], cache_dir=cache, **opened)
             check_scenes([trainer.scenes[0], watched], config.data, config.phases)
         options = {"until": until, "tensorboard": tensorboard, "wandb": wandb, "profile": profile}
         try:

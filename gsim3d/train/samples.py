@@ -92,7 +92,7 @@ def check_scenes(scenes: Sequence[Scene], data: DataConfig, phases: Sequence[Pha
             n_steps = (phase.history or data.history) + phase.horizon
             if scene.n_steps < n_steps:
                 raise InputError(f"{scene.path}: {scene.n_steps} steps; windows of {n_steps} steps do not fit")
-            if scene.n_cams - data.targets_apart * data.context_views < phase.target_views:
+            if not data.leave_one_out and scene.n_cams - data.targets_apart * data.context_views < phase.target_views:
                 raise InputError(f"{scene.path}: {scene.n_cams} cameras; {phase.target_views} target views do not fit")
         if len(context_cameras(scene, data)) < data.context_views:
             raise InputError(f"{scene.path}: too few cameras for {data.context_views} context views")
@@ -165,6 +165,7 @@ def _draw_window(
     targets = tuple(
         tuple(seen[index] for index in views.permutation(len(seen))[: phase.target_views]) for _ in range(n_steps)
     )
+    targets = (context,) * n_steps if data.leave_one_out else targets
     return Window(scene, start, n_context, (context,) * n_context, targets)
 
 

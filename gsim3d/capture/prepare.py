@@ -1,0 +1,213 @@
+"""From a capture to scenes that a model trains on: rate, crops, size, strides and depths, and the prepared images."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gsim3d.capture.check import angles
+from gsim3d.data import Scene
+from gsim3d.data.check import moving_box
+from gsim3d.data.fitting import Fitting, scale_colors, scale_labels
+from gsim3d.data.recording import BACKGROUND, MOVING, evenly_spaced
+from gsim3d.data.scene import SIZE_MULTIPLE
+from gsim3d.data.videos import FILE
+from gsim3d.errors import InputError
+
+WANTED_FPS = 15.0
+WORKING_SIDE = 512  # pixels; larger images are scaled down before anything else is done
+SIDES = {"cpu": 64, "cuda": 128}  # pixels, longer side of the images that a model sees
+PARTICLES = {"cpu": 1500, "cuda": 12_000}  # of a step
+PRESETS = {"cpu": "tiny", "cuda": "small"}
+HISTORY = {"cpu": 2, "cuda": 4}
+SAMPLES = 24  # steps of a take at which masks are looked at
+MARGIN = 0.15  # around the moving bodies, of the size of their box
+DEPTH_MARGINS = (0.85, 1.15)  # around the depths of the moving bodies
+HELD_OUT_SHARE = 0.15  # of a single take, its last steps
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """What a capture is turned into.
+
+    Attributes:
+        fps: frames per second.
+        size: (width, height) of the images in pixels.
+        crops: left, top, width and height of the crop of each camera, in pixels of the working images.
+        working_size: (width, height) of these images; None: as recorded.
+        bounds: corners [2][3] of the box in which bodies move, metres; None: unknown.
+        near_far: depth range in metres.
+        body_stride: every n-th row and column of pixels becomes a particle.
+        held_out_camera: camera that is only a target; None: every camera is an input.
+    """
+
+    fps: float
+    size: tuple[int, int]
+    crops: tuple[tuple[int, int, int, int], ...]
+    working_size: tuple[int, int] | None
+    bounds: list | None
+    near_far: tuple[float, float]
+    body_stride: int
+    held_out_camera: int | None
+
+
+def open_take(folder: Path, cache: Path, fps: float | None = None) -> Scene:
+    """Opens a take in working size, at ``fps`` or the rate nearest to WANTED_FPS that divides its own."""
+    recorded = Scene.open(folder)
+    width, height = (max(side) for side in zip(*recorded.recorded_sizes, strict=True))
+    share = WORKING_SIDE / max(width, height)
+    size = (round(width * share), round(height * share)) if share < 1 else None
+    rate = fps or recorded.fps / max(1, round(recorded.fps / WANTED_FPS))
+    cache.mkdir(parents=True, exist_ok=True)
+    return Scene.open(folder, cache_dir=cache, fitting=Fitting(size, enlarge=True, whole=True), fps=rate)
+
+
+def propose(takes: Sequence[Scene], device: str, say: Callable[[str], None]) -> Proposal:
+    """Decides how the takes of a capture are prepared, and says why."""
+    first = takes[0]
+    if any((take.fps, take.n_cams) != (first.fps, first.n_cams) for take in takes):
+        raise InputError("the takes differ in frame rate or number of cameras; capture them in folders of their own")
+    say(f"  rate: {first.fps:g} frames a second, nearest to {WANTED_FPS:g}: steps large enough to see motion")
+    has_masks = all(take.has_segmentation() for take in takes)
+    boxes, pixels = _boxes(takes) if has_masks else (_whole(first), max(w * h for w, h in first.recording.sizes))
+    aspect = float(np.median([box[2] / box[3] for box in boxes]))
+    longer = min(SIDES[device], max(max(box[2:]) for box in boxes))
+    size = _multiples(longer * min(1, aspect), longer * min(1, 1 / aspect))
+    crops = [_shaped(box, size, image) for box, image in zip(boxes, first.recording.sizes, strict=True)]
+    what = f"where bodies move, and {MARGIN:.0%} around" if has_masks else "the whole image, because there are no masks"
+    say(f"  crop: {what}; scaled to {size[0]}x{size[1]} pixels, what a model for {device} affords")
+    scale = max(size[0] / crop[2] for crop in crops)
+    particles = pixels * scale**2 * first.n_cams
+    stride = max(1, int(np.ceil(np.sqrt(particles / PARTICLES[device]))))
+    limit = PARTICLES[device]
+    say(f"  stride: {stride}, so that a step has about {particles / stride**2:.0f} particles (limit {limit})")
+    bounds = _bounds(takes) if has_masks else None
+    depths = first.near, first.far
+    if bounds is not None:
+        corners = np.array([[bounds[k >> axis & 1][axis] for axis in range(3)] for k in range(8)])
+        viewmats = first.recording.viewmats[0]
+        depth = corners @ viewmats[:, 2, :3].T + viewmats[:, 2, 3]
+        if depth.min() > 0:
+            depths = float(DEPTH_MARGINS[0] * depth.min()), float(DEPTH_MARGINS[1] * depth.max())
+    why = "around the moving bodies" if bounds is not None else "of the cameras"
+    say(f"  depth: {depths[0]:.2f} to {depths[1]:.2f} m, {why}")
+    held_out = _held_out_camera(first) if first.n_cams > 3 else None
+    if held_out is None:
+        say("  held out: no camera, because there are only 3; each is predicted from the particles of the others")
+    else:
+        say(f"  held out: camera {first.camera_names[held_out]}, which the others surround best")
+    working = first.fitting.size
+    return Proposal(first.fps, size, tuple(crops), working, bounds, depths, stride, held_out)
+
+
+def _boxes(takes: Sequence[Scene]) -> tuple[list[tuple], float]:
+    """Returns for each camera the box of its moving pixels (left, top, width, height), and their largest mean count."""
+    low, high, counts = [], [], []
+    for cam, (width, height) in enumerate(takes[0].recording.sizes):
+        moving = np.concatenate(
+            [(t.segmentation([cam], evenly_spaced(t.n_steps, SAMPLES))[:, 0] == MOVING).numpy() for t in takes]
+        )
+        y, x = (np.flatnonzero(moving.any((0, axis))) for axis in (2, 1))
+        if not len(x):
+            raise InputError(
+                f"{takes[0].path}: nothing moves in the masks of camera {takes[0].camera_names[cam]}; film a moving "
+                'body, give masks, or set "masks": "none" in cameras.json'
+            )
+        counts.append(moving.sum((1, 2)).mean())
+        border = MARGIN * max(np.ptp(x), np.ptp(y))
+        low.append((max(0, x[0] - border), max(0, y[0] - border)))
+        high.append((min(width, x[-1] + 1 + border), min(height, y[-1] + 1 + border)))
+    return [(*a, b[0] - a[0], b[1] - a[1]) for a, b in zip(low, high, strict=True)], max(counts)
+
+
+def _whole(scene: Scene) -> list[tuple]:
+    return [(0, 0, width, height) for width, height in scene.recording.sizes]
+
+
+def _multiples(width: float, height: float) -> tuple[int, int]:
+    return tuple(max(2 * SIZE_MULTIPLE, int(side // SIZE_MULTIPLE) * SIZE_MULTIPLE) for side in (width, height))
+
+
+def _shaped(box: tuple, size: tuple[int, int], image: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Returns the smallest box around ``box`` with the aspect of ``size``, moved into the image where it fits."""
+    share = max(box[2] / size[0], box[3] / size[1])
+    wanted = [max(1, round(side * share)) for side in size]
+    corner = []
+    for begin, length, side, limit in zip(box[:2], box[2:], wanted, image, strict=True):
+        start = begin + length / 2 - side / 2
+        corner.append(round(np.clip(start, 0, limit - side) if side <= limit else (limit - side) / 2))
+    return *corner, *wanted
+
+
+def _bounds(takes: Sequence[Scene]) -> list | None:
+    """Returns the box [2][3] around the visual hulls of the moving bodies; None if they are empty."""
+    found = [moving_box(take, step)[0] for take in takes for step in evenly_spaced(take.n_steps, 6)]
+    boxes = np.array([box for box in found if box is not None])
+    return np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)]).tolist() if len(boxes) else None
+
+
+def _held_out_camera(scene: Scene) -> int:
+    """Returns the camera with the smallest sum of angles to its two nearest neighbours."""
+    found = np.sort(angles(scene.recording.viewmats[0]), axis=1)
+    return int(np.argmin(found[:, 1] + found[:, 2]))
+
+
+def write_scene(take: Scene, proposal: Proposal, steps: Sequence[int], folder: Path) -> Path:
+    """Writes steps of a take as a scene of the layout videos: cropped, scaled and undistorted, with labels.
+
+    Args:
+        take: result of :func:`open_take`.
+        proposal: crops, size, depths.
+        steps: consecutive steps.
+        folder: scene folder; it appears complete.
+    """
+    import cv2
+
+    unfinished = folder.with_name(f".{folder.name}")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    viewmats, Ks = take.recording.cameras_at_step(0)
+    cameras = []
+    for cam, (name, crop) in enumerate(zip(take.camera_names, proposal.crops, strict=True)):
+        for kind in ("labels", "."):
+            (unfinished / kind / name).mkdir(parents=True, exist_ok=True)
+        for number, step in enumerate(steps):
+            image = take.recorded_images([cam], [step])[0, 0].permute(1, 2, 0).numpy()
+            labels = np.full(image.shape[:2], MOVING, np.uint8)
+            if take.has_segmentation():
+                labels = take.segmentation([cam], [step])[0, 0].numpy()
+            if (valid := take.valid([cam], [step])) is not None:
+                labels = np.where(valid[0, 0].numpy(), labels, BACKGROUND)
+            file = f"{name}/{number:05d}.png"
+            image, labels = (
+                f(_cropped(x, crop), proposal.size) for f, x in ((scale_colors, image), (scale_labels, labels))
+            )
+            cv2.imwrite(str(unfinished / file), image[..., ::-1])
+            cv2.imwrite(str(unfinished / "labels" / file), labels)
+        scale = np.diag([proposal.size[0] / crop[2], proposal.size[1] / crop[3], 1.0])
+        K = scale @ (Ks[cam] - [[0, 0, crop[0]], [0, 0, crop[1]], [0, 0, 0]])
+        R, T = viewmats[cam, :3, :3], viewmats[cam, :3, 3]
+        pose = {"K": K.tolist(), "R": R.tolist(), "T": T.tolist()}
+        cameras.append({"name": name, "size": list(proposal.size), **pose})
+    content = {"fps": proposal.fps, "near": proposal.near_far[0], "far": proposal.near_far[1], "cameras": cameras}
+    if proposal.bounds is not None:
+        content["bounds"] = proposal.bounds
+    (unfinished / FILE).write_text(json.dumps(content, indent=1))
+    shutil.rmtree(folder, ignore_errors=True)
+    os.replace(unfinished, folder)
+    return folder
+
+
+def _cropped(image: np.ndarray, crop: tuple[int, int, int, int]) -> np.ndarray:
+    """Returns the crop of an image, black outside."""
+    import cv2
+
+    left, top, width, height = crop
+    over = [max(0, -top), max(0, top + height - image.shape[0]), max(0, -left), max(0, left + width - image.shape[1])]
+    padded = cv2.copyMakeBorder(image, *over, cv2.BORDER_CONSTANT, value=0)
+    return padded[top + over[0] :, left + over[2] :][:height, :width]

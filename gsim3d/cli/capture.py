@@ -1,0 +1,45 @@
+"""``gsim3d capture``: from own films to a simulator."""
+
+from __future__ import annotations
+
+import argparse
+
+from gsim3d.cli.arguments import number
+from gsim3d.cli.calibrate import add_calibration, calibration_of
+
+EPILOG = """\
+Steps, each of which prints what it decides and why, writes its result, and is skipped when it is done:
+
+  calibrate   cameras.json beside the films (gsim3d calibrate), unless there are cameras
+  check       every file, angles between cameras, reprojection error of matched features     OUT/check.json
+  propose     frame rate, crop, size, stride, depth range; prepared scenes in OUT/scenes     OUT/proposal.json
+  train       settings for --minutes, and the model in OUT/model                             OUT/train.json
+  score       held-out steps against the constant baseline                                   OUT/metrics.json
+
+Refused unless --force: cameras further than 45 degrees from their nearest neighbour, and calibrations that do not fit.
+Delete a file in OUT to repeat its step.
+
+examples:
+  gsim3d capture films --board 7x5 --square 0.04 --out runs/capture --device cuda
+  gsim3d capture scene_with_cameras --out runs/capture --minutes 5
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.description = "Turns films of still cameras into a simulator, step by step."
+    parser.epilog = EPILOG
+    add = parser.add_argument
+    add("folder", metavar="DIR", help="folder with the films of a take, or with a folder for each take; or scenes")
+    add("--out", metavar="OUT", required=True, help="run folder, created or continued")
+    add_calibration(parser)
+    add("--minutes", type=number(0, 1e5, above=True), default=15.0, help="time to train (default: 15)")
+    add("--device", choices=("cpu", "cuda"), default="cpu", help="where to train (default: cpu)")
+    add("--force", action="store_true", help="go on where the check refuses")
+
+
+def run(args: argparse.Namespace) -> int:
+    from gsim3d.capture.run import capture
+
+    options = {"minutes": args.minutes, "device": args.device, "force": args.force}
+    capture(args.folder, args.out, **calibration_of(args), **options)
+    return 0

@@ -1,0 +1,56 @@
+"""Images of the input cameras, each drawn from the particles of the other cameras."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from gsim3d.cameras import Cameras, Frames
+from gsim3d.nn.multiview_encoder import StaticShapes, pixel_rows
+from gsim3d.state import Particles
+
+
+def with_views(particles: Particles, frames: Frames, shapes: StaticShapes | None = None) -> Particles:
+    """Returns encoded particles with their ``view``.
+
+    Args:
+        particles: result of encoding ``frames``.
+        frames: input frames with equally many images in every cloud, sorted by cloud.
+        shapes: as of :meth:`gsim3d.Simulator.encode`.
+    """
+    image = torch.arange(len(frames.cameras), device=particles.means.device) % images_per_cloud(frames)
+    view = pixel_rows(frames, image[:, None, None].expand(-1, *frames.images.shape[2:]), shapes)
+    return dataclasses.replace(particles, view=view)
+
+
+def images_per_cloud(frames: Frames) -> int:
+    """Returns the number of images of each cloud."""
+    return len(frames.cameras) // frames.cloud_scene.shape[0]
+
+
+def draw_left_out(
+    draw: Callable[[Particles, Cameras], Tensor], particles: Particles, cameras: Cameras, n_views: int
+) -> Tensor:
+    """Draws each image without the particles that came from its own camera.
+
+    Args:
+        draw: function (particles, cameras) -> images [I, H, W, 3].
+        particles: particles with ``view``; those of left-out views have opacity 0.
+        cameras: I cameras, ``n_views`` for each cloud, in the order of the input images.
+        n_views: input images of each cloud.
+
+    Returns:
+        Images [I, H, W, 3].
+
+    Gradients:
+        Exactly 0 from an image to the particles of its own camera.
+    """
+    images, number = [], torch.arange(len(cameras), device=particles.means.device).view(-1, n_views)
+    for view in range(n_views):
+        opacities = torch.where(particles.view == view, 0, particles.opacities)
+        others = dataclasses.replace(particles, opacities=opacities)
+        images.append(draw(others, cameras.select(number[:, view])))
+    return torch.stack(images, 1).flatten(0, 1)

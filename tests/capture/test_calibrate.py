@@ -1,0 +1,136 @@
+"""Calibration of rendered films: bounded errors of intrinsics, poses and time offsets; refusals."""
+
+import dataclasses
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from gsim3d.capture.board import Board
+from gsim3d.capture.calibrate import calibrate
+from gsim3d.capture.films import time_offsets
+from gsim3d.cli.main import main
+from gsim3d.data import Scene
+from gsim3d.data.recording import Problems
+from gsim3d.data.video_file import Video
+from gsim3d.errors import InputError
+from tests.capture.made_films import FPS, SIZE, rig, write_board_films, write_textured_films
+
+BOARD = Board(7, 5, 0.06)
+STARTS = (0.0, 3 / FPS, -2 / FPS)  # seconds
+
+
+@pytest.fixture(scope="module")
+def films(tmp_path_factory):
+    folder = write_board_films(tmp_path_factory.mktemp("films"), BOARD, rig(), STARTS)
+    assert main(["calibrate", str(folder), "--board", "7x5", "--square", "0.06"]) == 0
+    return folder
+
+
+def relative(viewmats):
+    return [viewmats[i] @ np.linalg.inv(viewmats[0]) for i in range(1, len(viewmats))]
+
+
+def cameras_of(folder):
+    entries = json.loads((folder / "cameras.json").read_text())["cameras"]
+    poses = [np.vstack([np.c_[e["R"], e["T"]], [0, 0, 0, 1]]) for e in entries]
+    return entries, poses
+
+
+def angle(a, b):
+    return np.degrees(np.linalg.norm(cv2.Rodrigues(a[:3, :3] @ b[:3, :3].T)[0]))
+
+
+def test_board_gives_intrinsics_and_metric_poses(films):
+    entries, poses = cameras_of(films)
+    for entry, (name, K, _) in zip(entries, rig(), strict=True):
+        assert entry["name"] == name and entry["calibration"]["error"] < 0.3
+        assert np.abs(np.array(entry["K"]) - K).max() < 3
+    for found, true in zip(relative(poses), relative([camera[2] for camera in rig()]), strict=True):
+        assert angle(found, true) < 0.3
+        assert np.linalg.norm(found[:3, 3] - true[:3, 3]) < 0.004
+
+
+def test_world_is_the_board_at_rest(films):
+    for pose, (_, _, true) in zip(cameras_of(films)[1], rig(), strict=True):
+        assert angle(pose, true) < 1.0
+        centre, expected = np.linalg.inv(pose)[:3, 3], np.linalg.inv(true)[:3, 3]
+        # The origin is the board's first corner: half a board to the left and behind its centre.
+        np.testing.assert_allclose(centre - expected, [0.21, -0.15, 0], atol=0.01)
+
+
+def test_offsets_of_films_reach_the_reader(films):
+    offsets = [entry["offset"] for entry in cameras_of(films)[0]]
+    np.testing.assert_allclose(np.diff(offsets), np.diff(STARTS), atol=0.01)
+    scene = Scene.open(films)
+    assert scene.n_steps == 54 - 5  # those that all three films show
+
+
+def test_offset_of_one_film_shifts_its_steps(films, tmp_path):
+    content = json.loads((films / "cameras.json").read_text())
+    for entry in content["cameras"]:
+        (tmp_path / f"{entry['name']}.avi").write_bytes((films / f"{entry['name']}.avi").read_bytes())
+        entry["offset"] = 0.5 if entry["name"] == "cam1" else 0.0
+    (tmp_path / "cameras.json").write_text(json.dumps(content))
+    moved, problems = Scene.open(tmp_path), Problems()
+    assert moved.n_steps == 54 - 15
+    video = Video(tmp_path / "cam0.avi", "cam0", SIZE, problems)
+    later = next(video.read([15], problems))  # cam1 began when frame 15 of the others was taken
+    assert (next(moved.recording.read_images(0, [0], problems)) == later).all()
+
+
+def test_a_board_that_is_not_seen_is_refused(films):
+    with pytest.raises(InputError, match="recognised in 0 images.*--dictionary"):
+        calibrate(films, board=dataclasses.replace(BOARD, dictionary="6X6_250"), say=lambda _: None)
+
+
+def test_a_calibration_that_does_not_fit_is_refused_by_its_error(films, tmp_path, monkeypatch):
+    monkeypatch.setattr("gsim3d.capture.calibrate.MAX_ERROR", 1e-5)
+    with pytest.raises(InputError, match=r"does not fit: reprojection error of cam0 0\.\d+ px"):
+        calibrate(films, board=BOARD, say=lambda _: None)
+
+
+def test_offsets_of_motion_are_found_within_a_fraction_of_a_frame():
+    rng, fine = np.random.default_rng(0), np.linspace(0, 12, 1200)
+    energy = np.interp(fine, np.linspace(0, 12, 60), rng.exponential(1, 60))
+    times = [np.arange(0, 8, 1 / 30), np.arange(0, 9, 1 / 25), np.arange(0, 8, 1 / 30)]
+    starts = (0.0, 1.23, 2.5)
+    motions = [
+        np.interp((t[1:] + t[:-1]) / 2 + s, fine, energy) + rng.normal(0, 0.02, len(t) - 1).clip(0)
+        for t, s in zip(times, starts)
+    ]
+    offsets, agreement = time_offsets(times, motions)
+    np.testing.assert_allclose(offsets, starts, atol=0.01)
+    assert agreement.min() > 0.9
+
+
+def test_films_without_common_motion_keep_their_times():
+    rng, times = np.random.default_rng(1), [np.arange(90) / 30] * 2
+    still = time_offsets(times, [np.full(89, 2.0) + rng.normal(0, 0.01, 89) for _ in times])
+    assert still[0].tolist() == [0, 0] and still[1].tolist() == [0, 0]
+
+
+def test_structure_from_motion_with_a_scale(tmp_path):
+    pytest.importorskip("pycolmap")
+    cameras = rig((-30, -15, 0, 15, 30), 1.0)
+    write_textured_films(tmp_path, cameras)
+    centres = [np.linalg.inv(camera[2])[:3, 3] for camera in cameras]
+    scale = f"cam0:cam4={np.linalg.norm(centres[0] - centres[4])}"
+    assert main(["calibrate", str(tmp_path), "--scale", scale]) == 0
+    for found, true in zip(relative(cameras_of(tmp_path)[1]), relative([c[2] for c in cameras]), strict=True):
+        assert angle(found, true) < 3
+        assert np.linalg.norm(found[:3, 3] - true[:3, 3]) < 0.1
+
+
+def test_cameras_without_common_features_are_refused(tmp_path):
+    pytest.importorskip("pycolmap")
+    write_textured_films(tmp_path, rig((-170, 0, 100), 1.0))
+    with pytest.raises(InputError, match="structure from motion connects . of 3 cameras"):
+        calibrate(tmp_path, say=lambda _: None)
+
+
+def test_missing_pycolmap_names_the_extra(films, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "pycolmap", None)
+    with pytest.raises(InputError, match=r"pip install 'gsim3d\[capture\]'"):
+        calibrate(films, say=lambda _: None)
