@@ -51,7 +51,7 @@ def calibrate(
     if wrong := set(names) ^ {file.stem for file in next(iter(takes.values()))}:
         raise InputError(f"{folder / BOARD}: must have one film of each camera; {', '.join(sorted(wrong))} differ")
     if board is None:
-        say(f"calibrate: structure from motion of {len(films)} median images, because no --board is given")
+        say(f"calibrate: structure from motion of {len(films)} backgrounds, because no --board is given")
         cameras = calibrate_sfm(films)
     else:
         offsets, _ = _offsets(films, say)

@@ -13,7 +13,7 @@ import numpy as np
 
 from gsim3d.capture.check import angles
 from gsim3d.data import Scene
-from gsim3d.data.check import moving_box
+from gsim3d.data.cameras import nearest_point, positions_and_axes
 from gsim3d.data.fitting import Fitting, scale_colors, scale_labels
 from gsim3d.data.recording import BACKGROUND, MOVING, evenly_spaced
 from gsim3d.data.scene import SIZE_MULTIPLE
@@ -146,10 +146,30 @@ def _shaped(box: tuple, size: tuple[int, int], image: tuple[int, int]) -> tuple[
 
 
 def _bounds(takes: Sequence[Scene]) -> list | None:
-    """Returns the box [2][3] around the visual hulls of the moving bodies; None if they are empty."""
-    found = [moving_box(take, step)[0] for take in takes for step in evenly_spaced(take.n_steps, 6)]
-    boxes = np.array([box for box in found if box is not None])
-    return np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)]).tolist() if len(boxes) else None
+    """Returns the box [2][3] around spheres that enclose the moving bodies at some steps; None if it is unknown.
+
+    The centre of a sphere is nearest to the rays through the centroids of the masks. Unlike visual hulls, spheres do
+    not stretch along the view of cameras that lie close together.
+    """
+    viewmats, Ks = takes[0].recording.cameras_at_step(0)
+    centres, _ = positions_and_axes(viewmats)
+    found = []
+    for take in takes:
+        for step in evenly_spaced(take.n_steps, SAMPLES):
+            masks = (take.segmentation(range(take.n_cams), [step])[0] == MOVING).numpy()
+            seen = np.flatnonzero(masks.any((1, 2)))
+            pixels = [np.argwhere(masks[cam])[:, ::-1] + 0.5 for cam in seen]
+            middles = np.array([[*own.mean(0), 1] for own in pixels])
+            rays = [viewmats[c, :3, :3].T @ np.linalg.solve(Ks[c], middle) for c, middle in zip(seen, middles)]
+            point = nearest_point(centres[seen], np.array(rays)) if len(seen) > 1 else None
+            if point is None:
+                continue
+            depths = viewmats[seen, 2, :3] @ point + viewmats[seen, 2, 3]
+            spans = [np.linalg.norm(own - m[:2], axis=1).max() for own, m in zip(pixels, middles)]
+            radius = (np.array(spans) * depths / Ks[seen, 0, 0]).max()
+            found.append((point - radius, point + radius))
+    boxes = np.array(found)
+    return np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)]).tolist() if found else None
 
 
 def _held_out_camera(scene: Scene) -> int:

@@ -11,7 +11,7 @@ import numpy as np
 from gsim3d.capture.board import Calibrated
 from gsim3d.capture.films import Film
 from gsim3d.data.cameras import focus, inverse, positions_and_axes
-from gsim3d.data.masks import median_image
+from gsim3d.data.masks import background_image
 from gsim3d.data.recording import Problems
 from gsim3d.errors import InputError
 
@@ -19,7 +19,7 @@ MIN_POINTS = 12  # of a camera
 
 
 def calibrate_sfm(films: Sequence[Film]) -> list[Calibrated]:
-    """Calibrates cameras by features that their median images share.
+    """Calibrates cameras by features that their backgrounds share.
 
     The world's origin is the point that the cameras look at, z the mean of their upward directions, and the mean
     distance of the cameras from the origin is 1.
@@ -39,7 +39,7 @@ def calibrate_sfm(films: Sequence[Film]) -> list[Calibrated]:
         images, database = Path(temporary) / "images", Path(temporary) / "features.db"
         images.mkdir()
         for film in films:
-            background = median_image(
+            background = background_image(
                 lambda steps: np.stack([*film.video.read(steps, Problems())]), len(film.video.times)
             )
             cv2.imwrite(str(images / f"{film.name}.png"), background[..., ::-1])

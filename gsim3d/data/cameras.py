@@ -116,7 +116,12 @@ def positions_and_axes(viewmats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def focus(viewmats: np.ndarray) -> np.ndarray | None:
     """Returns the point [3] closest to the optical axes of [N, 4, 4] by least squares; None if they are parallel."""
-    centres, axes = positions_and_axes(viewmats)
+    return nearest_point(*positions_and_axes(viewmats))
+
+
+def nearest_point(centres: np.ndarray, directions: np.ndarray) -> np.ndarray | None:
+    """Returns the point [3] closest to lines [N, 3] by least squares; None if they are nearly parallel."""
+    axes = directions / np.linalg.norm(directions, axis=1, keepdims=True)
     across = np.eye(3) - axes[:, :, None] * axes[:, None]
     if len(axes) < 2 or np.linalg.eigvalsh(across.mean(0))[0] < MIN_SPREAD:
         return None

@@ -8,7 +8,9 @@ import numpy as np
 
 from gsim3d.data.recording import evenly_spaced
 
-MEDIAN_STEPS = 51  # evenly spaced steps from which the median is computed
+BACKGROUND_STEPS = 51  # evenly spaced steps from which the background is computed
+SAME_COLOR = 9  # largest difference of a channel between equal colours, of 255
+ROWS = 32  # of the images that are compared at a time
 MIN_STEPS = 8  # fewest steps from which a background is estimated
 NOISE_FACTOR = 6.0  # foreground threshold, in multiples of the median difference ...
 MIN_DIFFERENCE = 18.0  # ... and its minimum, of 255
@@ -20,34 +22,38 @@ OUTLINE_FACTOR = 1.5  # by which the background's gradient exceeds the image's a
 MAX_HOLE = 0.005  # fraction of the image; smaller holes are filled
 
 
-def median_image(read: Callable[[Sequence[int]], np.ndarray], n_steps: int) -> np.ndarray:
-    """Estimates the background, uint8 [h, w, 3], of a static camera as its median over at most MEDIAN_STEPS steps.
+def background_image(read: Callable[[Sequence[int]], np.ndarray], n_steps: int) -> np.ndarray:
+    """Estimates the background, uint8 [h, w, 3], of a static camera from at most BACKGROUND_STEPS steps.
+
+    It is the most frequent colour of each pixel: a body that moves before it changes its shading. A body that rests
+    longest at its place is part of it, and leaves a ghost where it was: there the background has the outline of a
+    body and the image has none. Such pixels become the median of the images that show the ghost.
 
     Args:
         read: function steps -> uint8 [S, h, w, 3].
         n_steps: number of steps recorded.
     """
-    steps = evenly_spaced(n_steps, MEDIAN_STEPS)
-    frames = read(steps)
-    middle = len(steps) // 2
-    return np.partition(frames, middle, axis=0)[middle]
-
-
-def background_image(read: Callable[[Sequence[int]], np.ndarray], n_steps: int) -> np.ndarray:
-    """Estimates the background as :func:`median_image` does, without bodies that rest during most of the film.
-
-    Such a body is part of the median, and its place is marked as foreground once it leaves. There the median has the
-    outline of a body and the image has none: these pixels are replaced by their median over such images.
-
-    Arguments and result as :func:`median_image`.
-    """
-    steps = evenly_spaced(n_steps, MEDIAN_STEPS)
-    background, frames = median_image(read, n_steps), read(steps)
+    frames = read(evenly_spaced(n_steps, BACKGROUND_STEPS))
+    blocks = np.split(frames, range(ROWS, frames.shape[1], ROWS), axis=1)
+    background = np.concatenate([_most_frequent(rows) for rows in blocks])
     uncovered = np.stack([_ghosts(frame, background) for frame in frames])
     for y, x in np.argwhere(uncovered.any(0)):
         seen = frames[uncovered[:, y, x], y, x]
         background[y, x] = np.partition(seen, len(seen) // 2, axis=0)[len(seen) // 2]
     return background
+
+
+def _most_frequent(frames: np.ndarray) -> np.ndarray:
+    """Returns the mean [h, w, 3] of the largest set of values of a pixel around one of them, uint8 [S, h, w, 3]."""
+    best = np.zeros(frames.shape[1:3], np.int32)
+    result = frames[0].copy()
+    for frame in frames:
+        near = (np.maximum(frames, frame) - np.minimum(frames, frame)).max(-1) <= SAME_COLOR
+        count = near.sum(0)
+        mean = (frames * near[..., None].astype(np.uint16)).sum(0) / count[..., None]
+        result = np.where((count > best)[..., None], np.rint(mean).astype(np.uint8), result)
+        best = np.maximum(best, count)
+    return result
 
 
 def _ghosts(image: np.ndarray, background: np.ndarray) -> np.ndarray:

@@ -69,7 +69,7 @@ class Scene:
             None if lens is None else Undistorter(lens, size)
             for lens, size in zip(recording.distortions or (None,) * self.n_cams, recording.sizes, strict=True)
         ]
-        self._medians: dict[int, np.ndarray] = {}
+        self._backgrounds: dict[int, np.ndarray] = {}
         shape = (self.n_steps, self.n_cams, self.height, self.width)
         stamp = (CACHE_VERSION, str(path.resolve()), recording.source.stat().st_mtime_ns, *(fitting.size or ()))
         stamp += ("whole",) * fitting.whole
@@ -259,11 +259,11 @@ class Scene:
         def read(wanted: Sequence[int]) -> np.ndarray:
             return self._images.get(wanted, [cam])[:, 0, :height, :width]
 
-        if cam not in self._medians:
-            self._medians[cam] = background_image(read, self.n_steps)
+        if cam not in self._backgrounds:
+            self._backgrounds[cam] = background_image(read, self.n_steps)
         valid = self.valid([cam], [0])
         for step in steps:
-            labels = self._padded(foreground(read([step])[0], self._medians[cam]).astype(np.uint8) * MOVING)
+            labels = self._padded(foreground(read([step])[0], self._backgrounds[cam]).astype(np.uint8) * MOVING)
             yield labels if valid is None else labels * valid[0, 0].numpy()
 
     def _padded(self, image: np.ndarray) -> np.ndarray:

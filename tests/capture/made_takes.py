@@ -21,7 +21,7 @@ def cameras_at(degrees):
     return poses
 
 
-def write_take(folder: Path, degrees=(0, 25, 50), *, n_frames=40, starts=None, lens=None, **keys) -> Path:
+def write_take(folder: Path, degrees=(0, 25, 50), *, n_frames=72, starts=None, lens=None, **keys) -> Path:
     """``starts``: frames that each film begins late; ``keys`` of cameras.json."""
     folder.mkdir(parents=True)
     K = np.array([[1.3 * SIZE, 0, SIZE / 2], [0, 1.3 * SIZE, SIZE / 2], [0, 0, 1]])
@@ -31,8 +31,8 @@ def write_take(folder: Path, degrees=(0, 25, 50), *, n_frames=40, starts=None, l
         film = cv2.VideoWriter(str(folder / f"{name}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), FPS, (SIZE, SIZE))
         for frame in range(late, late + n_frames):
             time = frame / FPS
-            center = np.array([0.3 * np.sin(4 * time), 0.25 * np.cos(3 * time + 0.5), 0.5 + 0.12 * np.sin(5 * time)])
-            rgb, _ = draw(viewmat, K, SIZE, center, 0.25, np.array([0.9, 0.3, 0.2]))
+            center = np.array([0.5 * np.sin(3 * time), 0.45 * np.cos(2.3 * time + 0.5), 0.5 + 0.15 * np.sin(5 * time)])
+            rgb, _ = draw(viewmat, K, SIZE, center, 0.18, np.array([0.9, 0.3, 0.2]))
             film.write(rgb[..., ::-1])
         film.release()
         entry = {"name": name, "size": [SIZE, SIZE], "K": K.tolist(), "offset": late / FPS}

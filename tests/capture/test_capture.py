@@ -1,0 +1,120 @@
+"""The command capture: refusals with reasons, decisions, prepared scenes, skipped steps."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from gsim3d.capture import check, prepare
+from gsim3d.capture.run import _Run
+from gsim3d.cli.main import main
+from gsim3d.data import Scene, find_scenes
+from gsim3d.data.masks import background_image, foreground
+from tests.capture.made_films import rig, write_textured_films
+from tests.capture.made_takes import cameras_at, write_take
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("capture")
+    write_take(folder / "ball", starts=(0, 2, 1))
+    patch = pytest.MonkeyPatch()
+    patch.setattr("gsim3d.capture.run.PROBED", 1)
+    patch.setattr("gsim3d.capture.run.PHASES", ((0, 0.5, 2e-3), (2, 0.5, 1e-3)))
+    assert main(["capture", str(folder / "ball"), "--out", str(folder / "run"), "--minutes", "0.01"]) == 0
+    patch.undo()
+    return folder / "run"
+
+
+def test_capture_ends_with_a_score_and_skips_what_is_done(run, capsys):
+    scores = json.loads((run / "metrics.json").read_text())
+    assert scores["windows"] >= 1 and np.isfinite(scores["gain"])
+    before = (run / "model" / "metrics.jsonl").stat().st_mtime_ns
+    assert main(["capture", str(run.parent / "ball"), "--out", str(run)]) == 0
+    said = capsys.readouterr().out
+    assert all(f"{step}: done" in said for step in ("check", "propose", "train", "score"))
+    assert (run / "model" / "metrics.jsonl").stat().st_mtime_ns == before
+
+
+def test_prepared_scenes_are_cropped_and_synchronised_with_their_cameras(run):
+    (train,), (test,) = (find_scenes(run / "scenes" / part) for part in ("train", "test"))
+    scene, proposal = Scene.open(train), json.loads((run / "proposal.json").read_text())
+    assert scene.fps == 15 and scene.n_cams == 3 and [scene.width, scene.height] == proposal["size"]
+    assert proposal["held_out_camera"] is None
+    time = 2 / 30  # the latest film begins at frame 2
+    low, high = scene.bounds
+    for step in (0, 5):
+        at = time + step / 15
+        center = np.array([0.5 * np.sin(3 * at), 0.45 * np.cos(2.3 * at + 0.5), 0.5 + 0.15 * np.sin(5 * at)])
+        assert (low < center).all() and (center < high).all()
+        viewmats, Ks = scene.recording.cameras_at_step(step)
+        masks = scene.segmentation(range(3), [step])[0].numpy() == 3
+        for viewmat, K, mask in zip(viewmats, Ks, masks, strict=True):
+            pixel = K @ (viewmat[:3, :3] @ center + viewmat[:3, 3])
+            seen = np.argwhere(mask)[:, ::-1].mean(0) + 0.5
+            assert np.linalg.norm(pixel[:2] / pixel[2] - seen) < 1.0
+    assert Scene.open(test).n_steps + scene.n_steps == 36 - 1
+
+
+def test_views_far_apart_are_refused_with_their_angles(tmp_path, capsys):
+    write_take(tmp_path / "ball", (0, 55, 180), n_frames=16)
+    arguments = ["capture", str(tmp_path / "ball"), "--out", str(tmp_path / "run")]
+    assert main(arguments) == 2
+    message = capsys.readouterr().err
+    angles = check.angles(np.stack(cameras_at((0, 55, 180))))
+    assert f"left-middle {angles[0, 1]:.0f}, left-right {angles[0, 2]:.0f}" in message
+    assert "--force" in message and not (tmp_path / "run" / "check.json").exists()
+
+
+def test_a_wrong_camera_is_refused_by_the_error_of_matches(tmp_path):
+    cameras = rig((-15, 0, 15), 1.0)
+    write_textured_films(tmp_path, cameras)
+    entries = [
+        {"name": name, "size": [400, 300], "K": K.tolist(), "R": pose[:3, :3].tolist(), "T": pose[:3, 3].tolist()}
+        for name, K, pose in cameras
+    ]
+
+    def problem():
+        (tmp_path / "cameras.json").write_text(json.dumps({"pixel_center": 0, "cameras": entries}))
+        scene = Scene.open(tmp_path)
+        errors = check.match_errors(scene, check.angles(scene.recording.viewmats[0]))
+        assert errors
+        return check.fit_problem(errors, scene.width)
+
+    assert problem() is None
+    turn = cv2.Rodrigues(np.array([0.04, 0.0, 0.0]))[0]
+    entries[1] |= {key: (turn @ np.array(entries[1][key])).tolist() for key in ("R", "T")}
+    assert "does not fit" in problem() and "cam0-cam1" in problem() and "px" in problem()
+
+
+def test_force_goes_on_and_keeps_what_was_ignored(tmp_path):
+    write_take(tmp_path / "ball", (0, 60, 180), n_frames=16)
+    said = []
+    checked = _Run(tmp_path / "ball", tmp_path, "cpu", 1.0, True, said.append).check()
+    assert any("ignored, because of --force: the views do not overlap" in line for line in said)
+    assert len(checked["ignored"]) == 1
+
+
+def test_with_four_cameras_the_most_surrounded_is_held_out(tmp_path):
+    write_take(tmp_path / "ball", (0, 20, 40, 60), n_frames=24)
+    said = []
+    proposal = prepare.propose([prepare.open_take(tmp_path / "ball", tmp_path / "cache")], "cpu", said.append)
+    assert proposal.held_out_camera in (1, 2)
+    assert any("held out: camera middle" in line or "held out: camera right" in line for line in said)
+
+
+def test_a_body_that_rests_and_leaves_is_no_ghost():
+    rng = np.random.default_rng(0)
+    scenery = cv2.resize(rng.integers(40, 200, (12, 16, 3)).astype(np.uint8), (128, 96), interpolation=cv2.INTER_LINEAR)
+    frames = np.repeat(scenery[None], 40, 0)
+    for step in range(40):
+        x = 30 if step < 26 else 30 + 6 * (step - 25)  # rests for 65 % of the film
+        if x < 120:
+            frames[step, 30:60, x : x + 24] = (250, 20, 30)
+    frames = (frames + rng.normal(0, 2, frames.shape)).clip(0, 255).astype(np.uint8)
+    background = background_image(lambda steps: frames[list(steps)], 40)
+    assert np.abs(background.astype(int) - scenery).mean() < 2
+    for step in (3, 39):
+        mask, body = foreground(frames[step], background), (frames[step, ..., 0] > 200) & (frames[step, ..., 1] < 60)
+        assert (mask & ~body).mean() < 0.02 and mask[body].all()

@@ -1,0 +1,141 @@
+"""Training of captures: images drawn without the particles of their own camera, gains, masks of any folder, rates."""
+
+import dataclasses
+import json
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from gsim3d.data import Scene
+from gsim3d.dynamics import concatenate
+from gsim3d.errors import InputError
+from gsim3d.train.captured import CapturedLoss
+from gsim3d.train.config import DataConfig, LossConfig, PhaseConfig, TrainConfig
+from gsim3d.train.left_out import draw_left_out, images_per_cloud, with_views
+from gsim3d.train.loop import Trainer
+from gsim3d.train.losses import fitted_gain, training_loss
+from gsim3d.train.restore import restore
+from gsim3d.train.run import train
+from tests.tiny_scenes import write_scene
+
+CONFIG = TrainConfig(
+    phases=(PhaseConfig(steps=1, horizon=1, batch=2),),
+    data=DataConfig(history=2, context_views=3, context_cameras=(0, 1, 2), leave_one_out=True, subsample_fps=6.0),
+    loss=LossConfig(image_gain=True),
+)
+
+
+@pytest.fixture(scope="module")
+def trainer(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("left_out")
+    scenes = [Scene.open(write_scene(folder / f"{i}", seed=i), fps=6.0) for i in range(2)]
+    return Trainer(CONFIG, scenes, folder / "run")
+
+
+def test_targets_are_the_inputs(trainer):
+    batch = trainer._batch([0, 1])
+    assert len(batch.targets.cameras) == 2 * 3 * 3 and len(batch.context.cameras) == 2 * 2 * 3
+    by_cloud = batch.targets.cameras.viewmats.view(2, 3, 3, 4, 4)
+    torch.testing.assert_close(by_cloud[:, :2], batch.context.cameras.viewmats.view(2, 2, 3, 4, 4), rtol=0, atol=0)
+
+
+def test_no_gradient_to_particles_of_the_target_camera(trainer):
+    batch, simulator = trainer._batch([0, 1]), trainer.simulator
+    state = with_views(simulator.encode(batch.context), batch.context)
+    steps = simulator.rollout(state, 1, trainer.plan)
+    particles = concatenate([state, *steps])
+    assert particles.view.bincount().tolist() == [(particles.view == v).sum() for v in range(3)]
+    assert min(particles.view.bincount()) > 0
+    leaf = particles.means.detach().requires_grad_()
+    particles = dataclasses.replace(particles, means=leaf)
+    views = images_per_cloud(batch.context)
+    images = draw_left_out(
+        lambda p, cameras: simulator.render(p, cameras, plan=trainer.plan).color,
+        particles,
+        batch.targets.cameras,
+        views,
+    )
+    for view in range(3):
+        (gradient,) = torch.autograd.grad(images[view::3].square().sum(), leaf, retain_graph=True)
+        assert (gradient[particles.view == view] == 0).all()
+        assert all(gradient[particles.view == other].abs().max() > 0 for other in range(3) if other != view)
+
+
+def test_particles_know_the_image_they_come_from(trainer):
+    frames = trainer._batch([0]).context
+    state = with_views(trainer.simulator.encode(frames), frames)
+    counts = frames.masks.flatten(1).sum(1).view(-1, 3)
+    expected = torch.cat([torch.arange(3).repeat_interleave(row) for row in counts])
+    assert state.view.tolist() == expected.tolist()
+
+
+def test_captured_loss_leaves_out_the_same_particles(trainer):
+    batch = trainer._batch([0, 1])
+    loss, errors = trainer.loss(batch)
+    gradients = torch.autograd.grad(loss, list(trainer.parameters.values()), allow_unused=True)
+    captured = CapturedLoss(
+        trainer.simulator,
+        trainer.plan,
+        trainer.loss_of_images,
+        lambda part: torch.autocast("cpu", enabled=False),
+        (),
+        True,
+    )
+    found = captured(captured.prepare(batch), trainer.step_weights(batch), trainer.simulator.report)
+    torch.testing.assert_close(found.errors, errors, rtol=1e-4, atol=1e-6)
+    known = dict(zip(map(id, captured.parameters), found.parameters, strict=True))
+    for parameter, gradient in zip(trainer.parameters.values(), gradients, strict=True):
+        if gradient is not None and gradient.abs().max() > 1e-4:
+            assert (known[id(parameter)] - gradient).norm() < 0.02 * gradient.norm()
+
+
+def test_gain_of_an_image_is_fitted_within_limits(trainer):
+    pred = torch.rand(3, 8, 8, 3, generator=torch.Generator().manual_seed(0))
+    gains = torch.tensor([[1.2, 0.8, 1.0], [3.0, 0.1, 1.0], [1.0, 1.0, 1.0]])[:, None, None]
+    found = fitted_gain(pred, pred * gains)
+    torch.testing.assert_close(found, gains.clamp(1 / 1.5, 1.5))
+    targets = trainer._batch([0]).targets
+    images, weights = targets.images.permute(0, 2, 3, 1) * 0.8, torch.ones(3)
+    plain, _ = training_loss(LossConfig(), None, images, targets, weights)
+    gained, _ = training_loss(LossConfig(image_gain=True), None, images, targets, weights)
+    assert gained < 1e-9 < plain
+    assert (fitted_gain(torch.zeros(1, 2, 2, 3), torch.ones(1, 2, 2, 3)) == 1).all()
+
+
+def test_run_trains_at_the_subsampled_rate_and_its_model_asks_for_it(tmp_path):
+    folders = [write_scene(tmp_path / "data" / str(i), seed=i) for i in range(2)]
+    config = dataclasses.replace(CONFIG, phases=(PhaseConfig(steps=1, horizon=1),))
+    train(config, folders, tmp_path / "run")
+    scene = restore(tmp_path / "run").open_scene(folders[0])
+    assert scene.fps == 6 and scene.n_steps == 3
+
+
+def test_leaving_out_needs_two_views():
+    with pytest.raises(InputError, match="leave_one_out: needs two input views"):
+        DataConfig(context_views=1, leave_one_out=True)
+    with pytest.raises(InputError, match="targets_apart"):
+        DataConfig(leave_one_out=True, targets_apart=True)
+
+
+def test_masks_of_any_folder(tmp_path):
+    cameras = []
+    for cam in range(2):
+        entry = {"name": f"c{cam}", "size": [32, 16], "K": [[30, 0, 16], [0, 30, 8], [0, 0, 1]], "T": [0.1 * cam, 0, 3]}
+        cameras.append({**entry, "R": np.eye(3).tolist()})
+        for kind in (f"c{cam}", f"sam/c{cam}"):
+            (tmp_path / kind).mkdir(parents=True)
+        for frame in range(2):
+            segments = np.zeros((16, 32), np.uint8)
+            segments[4:8, 4 + frame : 12] = 7  # the number of a segment
+            cv2.imwrite(str(tmp_path / f"c{cam}" / f"{frame}.png"), np.full((16, 32, 3), 90, np.uint8))
+            cv2.imwrite(str(tmp_path / "sam" / f"c{cam}" / f"{frame}.png"), segments)
+    content = {"cameras": cameras, "fps": 10, "near": 1, "far": 5, "masks": "sam"}
+    (tmp_path / "cameras.json").write_text(json.dumps(content))
+    labels = Scene.open(tmp_path).segmentation([0, 1], [0, 1])
+    assert (labels[1, :, 4:8, 5:12] == 3).all() and (labels > 0).sum() == 2 * 4 * (8 + 7)
+    for bad, message in (("nothing", "a folder beside it"), ("../sam", "not a file inside"), (3, "a folder beside it")):
+        (tmp_path / "cameras.json").write_text(json.dumps(content | {"masks": bad}))
+        with pytest.raises(InputError, match=message):
+            Scene.open(tmp_path)
