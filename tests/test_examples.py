@@ -13,6 +13,7 @@ EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 ARGUMENTS = {
     "02_predict": ("falling/ball/0000", "predicted"),
     "03_edit": ("falling/ball/0000",),
+    "08_hybrid_scene": ("falling/ball/0000",),
     "04_train": ("small", "model"),
 }
 LONG = {"07_fit_scene": 190}  # a whole training, with densification

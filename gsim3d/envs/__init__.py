@@ -18,10 +18,11 @@ except ImportError:
 
 from gsim3d.envs import cloth, push
 from gsim3d.envs.cloth import ClothCover
+from gsim3d.envs.hybrid import HybridScene
 from gsim3d.envs.push import PushClear, PushToGoal
 from gsim3d.envs.throw import ThrowToTarget
 
-__all__ = ["ClothCover", "PushClear", "PushToGoal", "ThrowToTarget"]
+__all__ = ["ClothCover", "HybridScene", "PushClear", "PushToGoal", "ThrowToTarget"]
 
 _MAX_STEPS = {PushToGoal: push.MAX_STEPS, PushClear: push.MAX_STEPS, ThrowToTarget: None, ClothCover: cloth.MAX_STEPS}
 for _env, _max_steps in _MAX_STEPS.items():

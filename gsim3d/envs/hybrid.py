@@ -1,0 +1,111 @@
+"""Hybrid scenes: bodies of a MuJoCo model move particles of a learned scene."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from gsim3d.effects.actors import Actor
+from gsim3d.effects.edits import Rotate
+from gsim3d.effects.plan import Plan
+from gsim3d.effects.selection import Selection
+from gsim3d.envs.model import ActorRows
+from gsim3d.errors import InputError, NumericalError
+from gsim3d.simulator import Simulator
+from gsim3d.state import Particles, append_step, last_steps, newest_clouds
+
+if TYPE_CHECKING:
+    import mujoco
+
+
+class HybridScene:
+    """A scene in which bodies of a MuJoCo model drive particles, and a simulator predicts all others.
+
+    Particles of a body keep their places in its frame. The network sees the coming translation of a body, and its
+    rotation one step later. Predicted particles do not act on MuJoCo.
+
+    Args:
+        simulator: predicts the other particles.
+        state: last steps of one scene.
+        model: MuJoCo model.
+        data: its state at the newest step of ``state``; :meth:`step` advances it. Set ``data.ctrl`` in between.
+        bodies: name of a body in ``model`` -> its particles, moving ones.
+        fps: steps a second of the simulator.
+        plan: of the effects, without sleep. Default: that of ``simulator.plan``.
+
+    Attributes:
+        state: last steps of the scene; ``actor`` is the index of each particle's body in ``bodies``, or -1.
+        data: state of MuJoCo.
+
+    Raises:
+        InputError: ``state`` has several scenes, a body does not exist or has no particles, two bodies share some, or
+            ``1 / fps`` is not a multiple of MuJoCo's time step.
+    """
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        state: Particles,
+        model: mujoco.MjModel,
+        data: mujoco.MjData,
+        bodies: Mapping[str, Selection],
+        *,
+        fps: float,
+        plan: Plan | None = None,
+    ):
+        self._substeps = max(1, round(1 / (fps * model.opt.timestep)))
+        if abs(self._substeps * model.opt.timestep * fps - 1) > 1e-6:
+            raise InputError(f"1 / fps must be a multiple of the time step {model.opt.timestep:g} s; got fps {fps:g}")
+        if len(newest_clouds(state.clouds)) != 1:
+            raise InputError("state must have one scene")
+        known = [model.body(number).name for number in range(model.nbody)]
+        actor = torch.full_like(state.activity, -1, dtype=torch.int64)
+        for number, (name, selection) in enumerate(bodies.items()):
+            if name not in known:
+                raise InputError(f"bodies: MuJoCo's model has no body {name!r}; it has {', '.join(known)}")
+            chosen = selection.mask(state)
+            if bool((actor[chosen] >= 0).any()):
+                raise InputError(f"bodies: {name} shares particles with another body")
+            actor = torch.where(chosen, number, actor)
+        self.simulator, self.model, self.data, self.plan = simulator, model, data, plan or simulator.plan()
+        self.state, self._bodies = dataclasses.replace(state, actor=actor), [known.index(name) for name in bodies]
+
+    @torch.no_grad()
+    def step(self) -> Particles:
+        """Advances MuJoCo and the particles by one step. Returns the new particles.
+
+        Raises:
+            NumericalError: MuJoCo's state is not finite.
+        """
+        import mujoco
+
+        before, turned = (x[self._bodies].copy() for x in (self.data.xpos, self.data.xmat))
+        mujoco.mj_step(self.model, self.data, self._substeps)
+        mujoco.mj_kinematics(self.model, self.data)
+        if not np.isfinite(self.data.qpos).all():
+            raise NumericalError("the positions of MuJoCo's model are not finite; lower its time step")
+        after, matrices = self.data.xpos[self._bodies], self.data.xmat[self._bodies]
+        moved = torch.from_numpy(after - before)
+        actors = [Actor(one[None], ActorRows(number=number)) for number, one in enumerate(moved)]
+        step = self.simulator.rollout(self.state, 1, self.plan, actors=actors)[0]
+        for number, (old, new) in enumerate(zip(turned, matrices, strict=True)):
+            axis, angle = _rotation(new.reshape(3, 3) @ old.reshape(3, 3).T)
+            turn = Rotate(ActorRows(number=number), tuple(axis), np.degrees(angle), tuple(after[number]))
+            step = turn.apply(step, self.simulator.renderer)
+        if step.velocity is not None:
+            driven, newest = (step.actor >= 0)[:, None], last_steps(self.state, 1)
+            step = dataclasses.replace(step, velocity=torch.where(driven, step.means - newest.means, step.velocity))
+        self.state = append_step(self.state, step, self.plan.history)
+        return step
+
+
+def _rotation(matrix: np.ndarray) -> tuple[np.ndarray, float]:
+    """Axis [3] and angle in rad, below pi, of a rotation."""
+    twice = np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
+    sine = np.linalg.norm(twice) / 2
+    axis = twice / (2 * sine) if sine > 1e-12 else np.array([0.0, 0.0, 1.0])
+    return axis, float(np.arctan2(sine, (np.trace(matrix) - 1) / 2))
