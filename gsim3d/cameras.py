@@ -91,6 +91,8 @@ class Frames(TensorRecord):
         valid: bool [I, H, W], pixels with recorded values (no padding), to which losses are restricted; None: all.
         world_offset: float64 [B, 3] metres, see Particles.
         actions: motions of actors, :class:`gsim3d.Actions`; None: no actors.
+        backbone_features: [I, 4, P, C], of a frozen backbone
+            (:meth:`gsim3d.nn.multiview_encoder.Encoder.backbone_features`); None: computed from ``images``.
     """
 
     images: Tensor
@@ -103,6 +105,7 @@ class Frames(TensorRecord):
     valid: Tensor | None = None
     world_offset: Tensor | None = None
     actions: TensorRecord | None = None
+    backbone_features: Tensor | None = None
 
     def subsample(self, background_stride: int, body_stride: int) -> Frames:
         """Returns frames with subsampled masks: only every n-th row and column of pixels becomes particles.

@@ -230,6 +230,8 @@ class TrainConfig:
         phases: phases, run one after another.
         preset: model sizes, a function of gsim3d.presets such as ``tiny``.
         model: overrides of the preset, nested like the model section of a checkpoint's config.yaml.
+        pretrained_depth: .safetensors file of Depth Anything 3 or DINOv2 that a new run with ``backbone: vit_dpt``
+            starts from (:func:`gsim3d.nn.multiview_encoder.depth_weights.load_depth_weights`); empty: none.
         effects: effects to simulate, see :class:`gsim3d.effects.spec.EffectsSpec`.
         data: frames and views of a sample.
         loss: weights of the loss.
@@ -250,6 +252,7 @@ class TrainConfig:
     phases: tuple[PhaseConfig, ...] = (PhaseConfig(steps=1000), PhaseConfig(steps=4000, horizon=12))
     preset: str = "tiny"
     model: dict = dataclasses.field(default_factory=dict)
+    pretrained_depth: str = ""
     effects: dict = dataclasses.field(default_factory=dict)
     data: DataConfig = DataConfig()
     loss: LossConfig = LossConfig()
@@ -287,7 +290,7 @@ class TrainConfig:
 
 
 # Settings that may change when a run is resumed, without changing the results up to rounding.
-FREE_SETTINGS = ("captured", "checkpoint_every", "keep_checkpoints", "log_every", "recompute")
+FREE_SETTINGS = ("captured", "checkpoint_every", "keep_checkpoints", "log_every", "pretrained_depth", "recompute")
 # Settings of sections that may change when a run is resumed, to recover a diverged run; they change the results.
 FREE_OF_SECTIONS = {"optimizer": ("clip_norm", "max_skipped"), "phases": ("learning_rate", "warm_up")}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import signal
 import time
@@ -24,9 +25,11 @@ from gsim3d.evaluate.perceptual.lpips import LPIPS
 from gsim3d.evaluate.perceptual.weights import load
 from gsim3d.io import checkpoint
 from gsim3d.io.locks import only_one_writer
+from gsim3d.nn.multiview_encoder.depth_weights import load_depth_weights
 from gsim3d.pretrained.loading import check_device
 from gsim3d.train.captured import CapturedLoss, Prepared
 from gsim3d.train.config import PhaseConfig, TrainConfig, check_same_run, check_settings
+from gsim3d.train.features import FeatureCache
 from gsim3d.train.gradients import (
     Seen,
     StepWatch,
@@ -92,6 +95,8 @@ class Trainer:
         self.config, self.scenes, self.out = config, list(scenes), Path(out)
         self.effects = EffectsSpec.from_dict(config.effects)
         self.simulator = build_simulator(model_config(config), config.seed).to(device)
+        if config.pretrained_depth and not checkpoint.exists(self.out):
+            load_depth_weights(self.simulator.encoder, config.pretrained_depth)
         self.plan = self.simulator.plan(self.effects)
         if not self.effects.outputs.rgb:
             raise InputError("effects: outputs.rgb is off, but the loss compares colours; leave it on")
@@ -118,6 +123,8 @@ class Trainer:
         self.processes.check_agreement(
             **{"CONFIG": self.config, "--out": (self.step, self.parent), "--data": [s.name for s in self.scenes]}
         )
+        frozen = self.simulator.encoder.has_frozen_backbone
+        self.features = FeatureCache(self.simulator.encoder, device) if frozen else None
         self.captured = self._capture() if config.captured and device == "cuda" else None
 
     def _capture(self) -> CapturedLoss:
@@ -364,7 +371,11 @@ class Trainer:
     # ---- the loss of a batch ----
 
     def _batch(self, samples: list[int]) -> Batch:
-        return self._read(self.step, samples).to(self.device)
+        batch = self._read(self.step, samples)
+        if self.features is not None:
+            with self.config.precision.of("encoder", self.device):
+                batch = dataclasses.replace(batch, context=self.features(batch.context))
+        return batch.to(self.device)
 
     def _draw(self, step: int, samples: Sequence[int]) -> Batch:
         phase, _ = self.config.phase_of(step)

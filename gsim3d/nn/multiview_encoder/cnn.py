@@ -49,7 +49,7 @@ class CNN(nn.Module):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
 
     def forward(self, images: Tensor) -> Tensor:
-        mean, std = _statistics(images.dtype, images.device)
+        mean, std = image_statistics(images.dtype, images.device)
         x = F.relu(F.instance_norm(self.conv1((images - mean) / std)))
         for stage in self.stages:
             x = stage(x)
@@ -57,7 +57,7 @@ class CNN(nn.Module):
 
 
 @functools.cache
-def _statistics(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+def image_statistics(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
     """Mean and deviation [3, 1, 1] of the images that the network expects."""
     with torch.inference_mode(False):
         return tuple(torch.tensor(v, dtype=dtype, device=device)[:, None, None] for v in (IMAGE_MEAN, IMAGE_STD))

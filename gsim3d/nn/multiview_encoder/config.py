@@ -4,13 +4,65 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
-from gsim3d.errors import InputError, check_ranges
+from gsim3d.errors import InputError, check_ranges, did_you_mean
+from gsim3d.nn.vision_transformer import Architecture
+
+_SMALL, _BASE = (384, 6, 12), (768, 12, 12)  # channels, heads, blocks
+_ALONE, _MIXED = (2, 5, 8, 11), (5, 7, 9, 11)  # taken blocks
+_SMALL_HEAD, _BASE_HEAD = (64, (48, 96, 192, 384)), (128, (96, 192, 384, 768))
+BACKBONES = {
+    "tiny": Architecture(64, 4, 4, (0, 1, 2, 3), 0, 16, (16, 16, 32, 32), mlp_ratio=2, camera_blocks=1, grid=4),
+    "depth_anything_small": Architecture(*_SMALL, _MIXED, 4, *_SMALL_HEAD, offset=0.1, eps=1e-5, unit="cameras"),
+    "depth_anything_base": Architecture(*_BASE, _MIXED, 4, *_BASE_HEAD, offset=0.1, eps=1e-5, unit="cameras"),
+    "dinov2_small": Architecture(*_SMALL, _ALONE, None, *_SMALL_HEAD),
+    "dinov2_base": Architecture(*_BASE, _ALONE, None, *_BASE_HEAD),
+    "dinov3_small": Architecture(*_SMALL, _ALONE, None, *_SMALL_HEAD, patch=16, timm="vit_small_patch16_dinov3"),
+    "dinov3_base": Architecture(*_BASE, _ALONE, None, *_BASE_HEAD, patch=16, timm="vit_base_patch16_dinov3"),
+}
+
+
+@dataclass(frozen=True)
+class ViTConfig:
+    """A vision transformer with dense prediction heads for depth and latents.
+
+    Attributes:
+        model: one of BACKBONES: "depth_anything_small" and "depth_anything_base" attend over all views and know the
+            cameras; "dinov2_small", "dinov2_base", and of timm "dinov3_small", "dinov3_base", see each view alone;
+            "tiny" is for tests.
+        image_size: pixels of the longer side at which the network reads images, rounded to whole patches; depth and
+            features are brought back to the size of the image.
+        frozen: which parts keep their weights: "none", "backbone" (with the camera encoder), or "depth" (also the depth
+            head; the scale of depth, the features and the particles' heads learn).
+        feature_dim: F, channels of the second head.
+        min_confidence: pixels with a lower confidence are transparent; 1: none. Needs a model that mixes views.
+    """
+
+    model: str = "depth_anything_small"
+    image_size: int = 252
+    frozen: Literal["none", "backbone", "depth"] = "backbone"
+    feature_dim: int = 32
+    min_confidence: float = 1.0
+
+    def __post_init__(self):
+        if self.model not in BACKBONES:
+            known = f"must be one of {', '.join(BACKBONES)}; got {str(self.model)[:100]!r}"
+            raise InputError(f"ViTConfig: model {known}{did_you_mean(self.model, BACKBONES)}")
+        check_ranges(self, image_size=(1, 10**4), feature_dim=(1, 10**4), min_confidence=(1, 1e9))
+        if self.min_confidence > 1 and self.architecture.mixes_from is None:
+            raise InputError(f"ViTConfig: min_confidence must be 1: {self.model} predicts no confidence")
+
+    @property
+    def architecture(self) -> Architecture:
+        return BACKBONES[self.model]
 
 
 @dataclass(frozen=True)
 class EncoderConfig:
     """Sizes of the inverse renderer; the defaults are the paper's.
+
+    With ``backbone: vit_dpt`` only ``vit``, ``dynamic_dim`` and what follows it have an effect.
 
     Attributes:
         feature_dim: C, channels of the multi-view features; a multiple of 4.
@@ -35,6 +87,9 @@ class EncoderConfig:
         explicit: also predict rotation, scale and spherical harmonics of each particle.
         sh_degree: degree of these harmonics.
         scale_range: smallest and largest predicted scale, in tenths of a pixel's width plus height at its depth.
+        backbone: what predicts depth and features: "plane_sweep", a cost volume between the views, or "vit_dpt", a
+            vision transformer, which can start from published weights.
+        vit: its settings.
     """
 
     feature_dim: int = 128
@@ -59,6 +114,8 @@ class EncoderConfig:
     explicit: bool = False
     sh_degree: int = 3
     scale_range: tuple[float, float] = (0.5, 15.0)
+    backbone: Literal["plane_sweep", "vit_dpt"] = "plane_sweep"
+    vit: ViTConfig = ViTConfig()
 
     def __post_init__(self):
         if self.downscale_factor not in (2, 4, 8) or self.downscale_factor > 2 ** len(self.cnn_dims):
@@ -110,10 +167,14 @@ class EncoderConfig:
     @property
     def size_multiple(self) -> int:
         """Image height and width must be multiples of this."""
+        if self.backbone == "vit_dpt":
+            return 1
         at_features = math.lcm(self.window_split, 2 ** (self.cost_unet_levels - 1))
         return math.lcm(self.downscale_factor * at_features, 2 ** (self.refine_unet_levels - 1))
 
     @property
     def head_dim(self) -> int:
         """Channels of the full-resolution features that the heads read: U-Net, image, upsampled features."""
+        if self.backbone == "vit_dpt":
+            return self.vit.feature_dim + 3
         return self.refine_unet_dim + 3 + (self.upsampled_dim or self.feature_dim)

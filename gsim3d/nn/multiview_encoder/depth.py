@@ -35,6 +35,7 @@ class Views:
         far: [I] metres.
         n_views: V.
         geometry: what follows from the cameras; None: made where it is needed.
+        features: of a frozen backbone; None: made where they are needed.
     """
 
     images: Tensor
@@ -44,6 +45,7 @@ class Views:
     far: Tensor
     n_views: int
     geometry: ViewGeometry | None = None
+    features: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -120,7 +122,7 @@ class CostVolume(nn.Module):
         """[I, C, h, w] features -> [I, D, h, w] mean correlation with the other views."""
         src_images, cu_src = all_pairs(features.shape[0] // views.n_views, views.n_views, features.device)
         known = views.geometry
-        geometry = self.sweep_geometry(views) if known is None else (known.homographies, known.translations)
+        geometry = self.sweep_geometry(views) if known is None else known.of_depth
         geometry = (g.to(features.dtype) for g in geometry)
         return ops.plane_sweep(features, *geometry, disparities, src_images, cu_src, check=False)
 
@@ -154,6 +156,10 @@ class DepthPredictor(nn.Module):
         last = self.to_disparity[2]
         nn.init.normal_(last.weight, std=INITIAL_OUTPUT / last.in_channels**0.5)
         last.bias.data.copy_(torch.tensor([0.0, math.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY))]))
+
+    def geometry(self, views: Views) -> tuple[Tensor, ...]:
+        """What follows from cameras alone, float64."""
+        return self.cost_volume.sweep_geometry(views)
 
     def upsampling_stride(self, n: int) -> float:
         """Outputs between two of ``n`` inputs: they lie where the strided convolutions took them from."""

@@ -15,10 +15,11 @@ from gsim3d.nn.layers import tf32_only_if_asked
 from gsim3d.nn.multiview_encoder.checks import check_frames
 from gsim3d.nn.multiview_encoder.cnn import CNN
 from gsim3d.nn.multiview_encoder.config import EncoderConfig
-from gsim3d.nn.multiview_encoder.depth import DepthPredictor, Views
+from gsim3d.nn.multiview_encoder.depth import Depth, DepthPredictor, Views
 from gsim3d.nn.multiview_encoder.heads import ParticleHeads, PixelParticles, PixelRays
 from gsim3d.nn.multiview_encoder.static_shapes import PixelIndex, StaticShapes, ViewGeometry
 from gsim3d.nn.multiview_encoder.transformer import MultiViewTransformer
+from gsim3d.nn.multiview_encoder.vit_depth import ViTDepth
 from gsim3d.state import ASLEEP, DYNAMIC, FROZEN, CloudTable, Particles
 
 
@@ -39,7 +40,7 @@ def pixel_rows(frames: Frames, values: Tensor, shapes: StaticShapes | None = Non
 
 
 class Encoder(nn.Module):
-    """Multi-view features, a plane sweep, depth refinement and view-independent latents: one particle a pixel.
+    """Depth by a plane sweep or a vision transformer, and view-independent latents: one particle a pixel.
 
     Clouds are encoded independently of each other; each may have any number of views, one included (its depth then
     rests on its features alone).
@@ -53,9 +54,12 @@ class Encoder(nn.Module):
     def __init__(self, config: EncoderConfig):
         super().__init__()
         self.config = config
-        self.cnn = CNN(config)
-        self.transformer = MultiViewTransformer(config)
-        self.depth = DepthPredictor(config)
+        if config.backbone == "vit_dpt":
+            self.depth = ViTDepth(config)
+        else:
+            self.cnn = CNN(config)
+            self.transformer = MultiViewTransformer(config)
+            self.depth = DepthPredictor(config)
         self.heads = ParticleHeads(config)
         self.to(memory_format=torch.channels_last)  # convolutions with few channels are faster on it, on CPU and GPU
 
@@ -95,6 +99,29 @@ class Encoder(nn.Module):
         with tf32_only_if_asked():
             return self._encode(frames)
 
+    @property
+    def has_frozen_backbone(self) -> bool:
+        """Whether :meth:`backbone_features` of an image stay the same in training."""
+        return self.config.backbone == "vit_dpt" and self.config.vit.frozen != "none"
+
+    @torch.no_grad()
+    def backbone_features(self, frames: Frames) -> Tensor:
+        """Returns what the frozen backbone makes of images, to be kept as ``frames.backbone_features``.
+
+        Args:
+            frames: images and cameras of one cloud.
+        Returns:
+            [I, 4, P, C], of P patches; the bits that :meth:`forward` would compute.
+        Raises:
+            InputError: the encoder has no frozen backbone.
+        """
+        if not self.has_frozen_backbone:
+            raise InputError(
+                'Encoder.backbone_features: needs backbone "vit_dpt" with vit.frozen "backbone" or "depth"'
+            )
+        with tf32_only_if_asked():
+            return self.depth.tokens(_views(frames, len(frames.cameras)))
+
     @torch.no_grad()
     def static_shapes(self, frames: Frames, size: int) -> StaticShapes:
         """Static shapes that follow from the cameras; images and masks may then change.
@@ -113,7 +140,7 @@ class Encoder(nn.Module):
         if not torch.equal(ordered, cameras.image_cloud):
             raise InputError("Encoder.static_shapes: cameras.image_cloud must ascend, as many views in each cloud")
         views = _views(frames, n_views)
-        geometry = ViewGeometry(PixelRays.of(views), *self.depth.cost_volume.sweep_geometry(views))
+        geometry = ViewGeometry(PixelRays.of(views), self.depth.geometry(views))
         scenes, steps = torch.stack([frames.cloud_scene, frames.cloud_step]).tolist()
         return StaticShapes(CloudTable.make([size] * n_clouds, scenes, steps, frames.images.device), geometry)
 
@@ -152,17 +179,23 @@ class Encoder(nn.Module):
         groups = {count: order[n_views[image_cloud[order]] == count] for count in n_views.unique().tolist() if count}
         parts = []
         for count, images in groups.items():
-            chosen = dataclasses.replace(frames, images=frames.images[images], cameras=frames.cameras.select(images))
+            features = None if frames.backbone_features is None else frames.backbone_features[images]
+            of_images = {"images": frames.images[images], "backbone_features": features}
+            chosen = dataclasses.replace(frames, **of_images, cameras=frames.cameras.select(images))
             parts.append(self._predict(_views(chosen, count), frames.origin[_scene_of_image(chosen)]))
         place = torch.cat(list(groups.values())).argsort()[order] if len(groups) > 1 else None
         return self._assemble(frames, parts, place, order, n_views)
 
     def _predict(self, views: Views, origin: Tensor) -> PixelParticles:
         """origin: [I, 3], of the scene that each image shows."""
+        return self.heads(self._depth(views), views, origin)
+
+    def _depth(self, views: Views) -> Depth:
+        if self.config.backbone == "vit_dpt":
+            return self.depth(views)
         cnn_features = self.cnn(views.images)
         view_features = self.transformer(cnn_features.unflatten(0, (-1, views.n_views))).flatten(0, 1)
-        depth = self.depth(view_features, cnn_features, views)
-        return self.heads(depth, views, origin)
+        return self.depth(view_features, cnn_features, views)
 
     def _assemble(
         self, frames: Frames, parts: list[PixelParticles], place: Tensor | None, order: Tensor, n_views: Tensor
@@ -201,7 +234,7 @@ class Encoder(nn.Module):
 def _views(frames: Frames, n_views: int, geometry: ViewGeometry | None = None) -> Views:
     cameras, images = frames.cameras, frames.images.contiguous(memory_format=torch.channels_last)
     Ks, viewmats = cameras.Ks.double(), cameras.viewmats.double()
-    return Views(images, Ks, viewmats, cameras.near, cameras.far, n_views, geometry)
+    return Views(images, Ks, viewmats, cameras.near, cameras.far, n_views, geometry, frames.backbone_features)
 
 
 def _scene_of_image(frames: Frames) -> Tensor:

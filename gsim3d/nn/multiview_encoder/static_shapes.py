@@ -18,16 +18,15 @@ class ViewGeometry:
 
     Attributes:
         rays: of their pixels.
-        homographies: [P, 3, 3] between the feature maps of all pairs of views of a cloud.
-        translations: [P, 3], the same.
+        of_depth: what the prediction of depth makes of them: for a plane sweep homographies [P, 3, 3] and translations
+            [P, 3] between the feature maps of all pairs of views of a cloud.
     """
 
     rays: PixelRays
-    homographies: Tensor
-    translations: Tensor
+    of_depth: tuple[Tensor, ...]
 
     def tensors(self) -> list[Tensor]:
-        return [*vars(self.rays).values(), self.homographies, self.translations]
+        return [*vars(self.rays).values(), *self.of_depth]
 
 
 @dataclass(frozen=True)
