@@ -47,7 +47,8 @@ class FeatureCache:
         return dataclasses.replace(frames, backbone_features=features)
 
     def _of_cloud(self, frames: Frames, images: Tensor) -> Tensor:
-        one = dataclasses.replace(frames, images=frames.images[images], cameras=frames.cameras.select(images))
+        scene = (frames.cloud_scene, frames.cloud_step, frames.origin)
+        one = Frames(frames.images[images], frames.cameras.select(images), *scene)
         key = hashlib.blake2b(digest_size=20)
         for tensor in (one.images, one.cameras.viewmats, one.cameras.Ks):
             key.update(tensor.contiguous().numpy())
