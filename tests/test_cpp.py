@@ -1,12 +1,20 @@
 """The torch-free core: its C++ tests, and a stranger's CMake project built against the installed package."""
 
+import os
 import platform
 import shutil
 import subprocess
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import cv2
 import pytest
+import torch
+
+from gsim3d.cameras import Cameras
+from gsim3d.io.ply import write_ply
+from gsim3d.ops import rasterize_gaussians
+from gsim3d.state import Gaussians
 
 ROOT = Path(__file__).parent.parent
 
@@ -51,6 +59,29 @@ def test_foreign_project_builds_against_the_install_tree(prefix, tmp_path):
     run("cmake", "--build", tmp_path / "app")
     assert run(tmp_path / "app" / "app").split() == ["3", "3"]
 
+    render(tmp_path / "app" / "render_ply", tmp_path)
+
+
+def render(program, folder):
+    """The example draws what the op draws; a file that is none is refused."""
+    g = torch.Generator().manual_seed(0)
+    means, quats = torch.randn(200, 3, generator=g), torch.randn(200, 4, generator=g)
+    scales, opacities = 0.02 + 0.1 * torch.rand(200, 3, generator=g), 0.2 + 0.7 * torch.rand(200, generator=g)
+    sh = 1.7 * torch.rand(200, 1, 3, generator=g)
+    write_ply(folder / "in.ply", Gaussians(means, quats, scales, opacities, sh, torch.tensor([0, 200])))
+    run(program, folder / "in.ply", folder / "out.png")
+    low, high = means.amin(0), means.amax(0)
+    middle = (low + high) / 2
+    viewmat = torch.eye(4)[None].clone()
+    viewmat[0, :3, 3] = torch.stack([-middle[0], -middle[1], 2 * (high - middle)[:2].max() - low[2]])
+    K = torch.tensor([[[320.0, 0, 320], [0, 320, 240], [0, 0, 1]]])
+    cameras = Cameras(viewmat, K, torch.full((1,), 1e-3), torch.ones(1), torch.zeros(1, dtype=torch.int64), 640, 480)
+    expected = rasterize_gaussians(means, quats, scales, opacities, cameras, sh=sh, background=torch.zeros(1, 3))
+    image = cv2.imread(str(folder / "out.png"))[..., ::-1].astype(float)
+    assert abs(image - 255 * expected.color[0].clamp(0, 1).numpy()).max() < 1 and image.max() > 50
+    (folder / "bad.ply").write_text("ply\nelement vertex 3\nend_header\n")
+    assert subprocess.run([program, folder / "bad.ply", folder / "none.png"], capture_output=True).returncode == 1
+
 
 def test_installed_headers_compile_alone_and_together(prefix, tmp_path):
     include = prefix / "include"
@@ -72,6 +103,7 @@ def test_other_headers_compile_alone(header, tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("nvcc") is None, reason="nvcc is not installed")
 def test_every_cuda_source_compiles(tmp_path):
+    """And a stranger's CUDA program builds against the install tree, and runs where a GPU is."""
     run(
         "cmake",
         "-G",
@@ -79,14 +111,21 @@ def test_every_cuda_source_compiles(tmp_path):
         "-S",
         ROOT,
         "-B",
-        tmp_path,
+        tmp_path / "build",
         "-DGSIM3D_CUDA=ON",
         "-DGSIM3D_BUILD_TESTS=OFF",
         "-DCMAKE_CUDA_ARCHITECTURES=90a-real",
     )
-    run("cmake", "--build", tmp_path, "--parallel", "2", "--target", "gsim3d_cuda")
+    run("cmake", "--build", tmp_path / "build", "--parallel", str(len(os.sched_getaffinity(0))))
     objects = {path.name.removesuffix(".o") for path in tmp_path.rglob("*.cu.o")}
     assert objects == {path.name for path in (ROOT / "csrc").rglob("*.cu")} and objects
+    run("cmake", "--install", tmp_path / "build", "--prefix", tmp_path / "prefix")
+    consumer, prefix = ROOT / "tests" / "cpp" / "consumer", tmp_path / "prefix"
+    options = [f"-DCMAKE_PREFIX_PATH={prefix}", "-DCMAKE_CUDA_ARCHITECTURES=90a-real"]
+    run("cmake", "-G", "Ninja", "-S", consumer, "-B", tmp_path / "app", *options)
+    run("cmake", "--build", tmp_path / "app")
+    if torch.cuda.is_available():
+        assert run(tmp_path / "app" / "app_cuda").split() == ["3", "3"]
 
 
 @pytest.mark.slow

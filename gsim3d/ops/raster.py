@@ -348,12 +348,14 @@ def _batched(size, inputs, is_batched):
 
 
 def _backward_batched(size, inputs, is_batched):
+    if not is_batched[6]:  # the state is of one scene, which all entries share: only gradients of its images differ
+        each = [[x[k] if has else x for x, has in zip(inputs, is_batched, strict=True)] for k in range(size)]
+        return tuple(map(torch.stack, zip(*(call("rasterize_gaussians_backward", *one) for one in each), strict=True)))
     of_images = [
         (x if has else x.expand(size, *x.shape)).flatten(0, 1) for x, has in zip(inputs[:6], is_batched, strict=False)
     ]
-    state = inputs[6][0] if is_batched[6] else inputs[6]
     rows, options = _folded(size, inputs[7:18], is_batched[7:18], inputs[18:])
-    grads = call("rasterize_gaussians_backward", *of_images, state, *rows, *options, inputs[-1])
+    grads = call("rasterize_gaussians_backward", *of_images, inputs[6][0], *rows, *options, inputs[-1])
     return tuple(x.reshape(size, x.shape[0] // size, *x.shape[1:]) for x in grads)
 
 

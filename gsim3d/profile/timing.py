@@ -66,18 +66,19 @@ class DeviceClock:
             return 0.0
         if self._mark_cost is None:
             graphs = [Captured(partial(self._chain, marks), self._gpu) for marks in (True, False)]
-            times = [[self.seconds(*graph()) for graph in graphs] for _ in range(REPLAYS)]
+            runs = ((graph() for graph in graphs) for _ in range(REPLAYS))
+            times = [[self.seconds(run[0], run[-1]) for run in pair] for pair in runs]
             self._mark_cost = max(0.0, statistics.median((marked - plain) / CHAIN for marked, plain in times))
         return self._mark_cost
 
-    def _chain(self, marks: bool) -> tuple[Any, Any]:
-        """Launches small dependent kernels, each followed by a mark if ``marks``. Returns marks of start and end."""
-        value, first = torch.zeros((), device=self._gpu), self.mark()
+    def _chain(self, marks: bool) -> list[Any]:
+        """Launches small kernels, a mark behind each if ``marks``. Returns all marks: they must outlive the graph."""
+        value, all_marks = torch.zeros((), device=self._gpu), [self.mark()]
         for _ in range(CHAIN):
             value.add_(1)
             if marks:
-                self.mark()
-        return first, self.mark()
+                all_marks.append(self.mark())
+        return [*all_marks, self.mark()]
 
     def seconds(self, first: Any, last: Any) -> float:
         """Seconds between two marks; waits for the second one."""

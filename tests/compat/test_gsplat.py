@@ -328,3 +328,129 @@ def test_default_strategy_of_gsplat(absgrad, packed):
         strategy.step_post_backward(params, optimizers, state, step, info, packed=packed)
         losses.append(loss.item()), counts.append(len(params["means"]))
     assert len(set(counts)) > 1 and min(losses[-5:]) < losses[0]
+
+
+# ---- gsplat's kernels, on a GPU --------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def gsplat_on_gpu(devices):
+    """gsplat and the GPU; gsplat compiles its kernels at first use."""
+    gsplat = pytest.importorskip("gsplat", reason="pip install --no-deps gsplat==1.5.3 rich jaxtyping")
+    from gsplat.cuda import _backend
+
+    if _backend._C is None:
+        pytest.skip("gsplat has no compiled kernels here")
+    return gsplat, devices[1]
+
+
+def both_sides(gsplat, device, arguments, options):
+    """(images, gradients, meta) of this call and of gsplat's, for the same mix of all outputs."""
+    results = []
+    for call in (rasterization, gsplat.rasterization):
+        leaves = {name: x.to(device).requires_grad_() for name, x in arguments.items()}
+        color, alpha, meta = call(**leaves, **SIZE, **options)
+        meta["means2d"].retain_grad()
+        g = torch.Generator().manual_seed(7)
+        mixes = [torch.randn(x.shape, generator=g).to(device) for x in (color, alpha)]
+        ((mixes[0] * color).sum() + (mixes[1] * alpha).sum()).backward()
+        grads = {name: x.grad for name, x in leaves.items() if x.grad is not None and name != "Ks"}
+        grads["means2d"] = meta["means2d"].grad
+        if options.get("absgrad"):
+            grads["absolute"] = meta["means2d"].absgrad
+        results.append(((color.detach(), alpha.detach()), grads, meta))
+    return results
+
+
+def assert_close_but_for_jumps(actual, expected, what):
+    """float32 on both sides: an alpha at 1/255, or light at 1e-4, falls on either side of its limit in few places."""
+    error = (actual - expected).double().abs() / expected.double().abs().max().clamp_min(1e-12)
+    assert (error > 1e-4).double().mean() < 2e-3 and error.max() < 2e-2, f"{what}: {error.max():.3g}"
+
+
+BESIDE = [
+    *({"render_mode": mode} for mode in ("RGB", "D", "ED", "RGB+D", "RGB+ED")),
+    *({"rasterize_mode": "antialiased", "camera_model": model} for model in ("pinhole", "ortho", "fisheye")),
+    *({"camera_model": model, "packed": False} for model in ("ortho", "fisheye")),
+    {"eps2d": 0.1},
+    {"near_plane": 2.8, "far_plane": 3.3},
+    {"radius_clip": 4.0},
+    {"packed": False},
+    {"absgrad": True, "packed": False},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("batch", [(), (2,)])
+@pytest.mark.parametrize("options", BESIDE, ids=lambda options: "-".join(map(str, options.values())))
+def test_images_and_gradients_beside_gsplat(gsplat_on_gpu, options, batch):
+    if batch and options.get("packed", True):
+        options = options | {"packed": False}  # gsplat 1.5.3 packs one batch
+    (images, grads, meta), (their_images, their_grads, their_meta) = both_sides(
+        *gsplat_on_gpu, scene_of(batch, n=300, dtype=torch.float32), options
+    )
+    for what, a, e in zip(("images", "alpha"), images, their_images, strict=True):
+        assert_close_but_for_jumps(a, e, what)
+    for name in grads.keys() & their_grads.keys() - ({"means2d"} if options.get("packed", True) else set()):
+        error = (grads[name] - their_grads[name]).norm() / their_grads[name].norm().clamp_min(1e-12)
+        assert error < 3e-3, f"gradient of {name}: {error:.3g}"
+    if not options.get("packed", True):
+        seen = ((meta["radii"] > 0) & (their_meta["radii"] > 0)).all(-1)
+        assert ((their_meta["radii"] > 0).all(-1) ^ seen).double().mean() < 0.1
+        for name in ("means2d", "depths", "conics"):
+            assert_close_relative_to_max(meta[name][seen], their_meta[name][seen], "projection_float32", name)
+
+
+@pytest.mark.parametrize("channels", [1, 3, 32, 128])
+def test_channels_beside_gsplat(gsplat_on_gpu, channels):
+    arguments = scene_of(n=300, channels=channels, dtype=torch.float32)
+    (images, grads, _), (their_images, their_grads, _) = both_sides(*gsplat_on_gpu, arguments, {"packed": False})
+    for what, a, e in zip(("images", "alpha"), images, their_images, strict=True):
+        assert_close_but_for_jumps(a, e, what)
+    for name in grads.keys() & their_grads.keys():
+        error = (grads[name] - their_grads[name]).norm() / their_grads[name].norm()
+        assert error < 3e-3, f"gradient of {name}: {error:.3g}"
+
+
+@pytest.mark.parametrize("sh_degree", range(5))
+def test_harmonics_beside_gsplat(gsplat_on_gpu, sh_degree):
+    arguments = scene_of(n=300, dtype=torch.float32)
+    arguments["colors"] = 0.3 * torch.randn(300, 25, 3, generator=torch.Generator().manual_seed(1))
+    options = {"packed": False, "sh_degree": sh_degree}
+    (images, grads, _), (their_images, their_grads, _) = both_sides(*gsplat_on_gpu, arguments, options)
+    for what, a, e in zip(("images", "alpha"), images, their_images, strict=True):
+        assert_close_but_for_jumps(a, e, what)
+    for name in grads.keys() & their_grads.keys() - {"viewmats"}:  # there the centre is that of an inverted matrix
+        error = (grads[name] - their_grads[name]).norm() / their_grads[name].norm()
+        assert error < 3e-3, f"gradient of {name}: {error:.3g}"
+
+
+def test_mcmc_strategy_of_gsplat(gsplat_on_gpu):
+    gsplat, device = gsplat_on_gpu
+    scene = {name: x.to(device) for name, x in scene_of(n=100, dtype=torch.float32).items()}
+    params = {
+        "means": scene["means"],
+        "quats": scene["quats"],
+        "scales": scene["scales"].log(),
+        "opacities": torch.logit(scene["opacities"].clamp(0.02, 0.9)),
+        "colors": torch.logit(scene["colors"].clamp(0.1, 0.9)),
+    }
+    params["opacities"][:10] = -8  # dead: they are moved
+    params = torch.nn.ParameterDict({name: torch.nn.Parameter(x.clone()) for name, x in params.items()})
+    optimizers = {name: torch.optim.Adam([x], lr=0.01) for name, x in params.items()}
+    strategy = gsplat.MCMCStrategy(cap_max=120, refine_start_iter=2, refine_every=5, noise_lr=1.0)
+    strategy.check_sanity(params, optimizers)
+    state, target, losses = strategy.initialize_state(), torch.rand(2, 37, 45, 3, device=device), []
+    for step in range(40):
+        color, _, info = rasterization(
+            params["means"], params["quats"], params["scales"].exp(), params["opacities"].sigmoid(),
+            params["colors"].sigmoid(), scene["viewmats"], scene["Ks"], **SIZE,
+        )  # fmt: skip
+        loss = (color - target).abs().mean()
+        loss.backward()
+        for optimizer in optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad()
+        strategy.step_post_backward(params, optimizers, state, step, info, lr=1e-4)
+        losses.append(loss.item())
+    assert len(params["means"]) == 120 and min(losses[-5:]) < losses[0]
+    assert params["opacities"].sigmoid().min() > 0.003

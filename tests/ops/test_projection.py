@@ -43,6 +43,7 @@ class Case:
             )
         self.names += ["viewmats", "Ks", "distortion"]
         self.image_cloud, self.cu_rows, self.opacities = scene.image_cloud, scene.cu_rows, scene.opacities
+        self.n_pairs = int((self.cu_rows[1:] - self.cu_rows[:-1])[self.image_cloud].sum())
         self.leaves = [x.to(dtype).to(device) for x in self.leaves]
         self.device = torch.device(device)
 
@@ -56,10 +57,6 @@ class Case:
         options = {"lens": self.lens, "cu_rows": self.cu_rows.to(self.device), "n_pairs": self.n_pairs} | options
         means, quats, scales = given.pop("means"), given.pop("quats", None), given.pop("scales", None)
         return project_gaussians(means, quats, scales, cameras, **given, **options)
-
-    @property
-    def n_pairs(self):
-        return int((self.cu_rows[1:] - self.cu_rows[:-1])[self.image_cloud].sum())
 
     def expected(self, *leaves, clamped=False, dilation=0.3):
         """The oracle's pairs and radii."""

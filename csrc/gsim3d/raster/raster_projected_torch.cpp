@@ -4,6 +4,7 @@
 #include <utility>
 
 #include "gsim3d/raster/raster.h"
+#include "gsim3d/torch/raster_image_grads.h"
 #include "gsim3d/torch/torch_utils.h"
 
 namespace gsim3d::binding {
@@ -114,8 +115,8 @@ Images rasterize_projected(const Tensor& means2d, const Tensor& conics, const Te
 using ProjectedGrads = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 ProjectedGrads rasterize_projected_backward(
-    const Tensor& grad_color_, const Tensor& grad_alpha_, const Tensor& grad_depth_, const Tensor& grad_features_,
-    const Tensor& transmittance_, const Tensor& last_, const Tensor& state_, const Tensor& means2d,
+    const Tensor& grad_color, const Tensor& grad_alpha, const Tensor& grad_depth, const Tensor& grad_features,
+    const Tensor& transmittance, const Tensor& last, const Tensor& state, const Tensor& means2d,
     const Tensor& conics, const Tensor& depths, const Tensor& opacities, const Tensor& color, const Tensor& features,
     const Tensor& background, const Tensor& image_cloud, const Tensor& cu_rows, int64_t width, int64_t height,
     int64_t cutoff, int64_t max_pairs, int64_t max_entries, int64_t max_slots, bool absolute) {
@@ -124,22 +125,8 @@ ProjectedGrads rasterize_projected_backward(
                                cu_rows, width, height, cutoff};
   given.check_all();
   const ProjectedTensors in = given.contiguous();
-  const Tensor grad_color = rows_of(grad_color_), grad_alpha = rows_of(grad_alpha_), grad_depth = rows_of(grad_depth_);
-  const Tensor grad_features = rows_of(grad_features_), transmittance = rows_of(transmittance_);
-  const Tensor last = rows_of(last_), state = rows_of(state_);
-  const int64_t n = in.n_images();
-  check_shape(op, "grad_color", grad_color, {n, height, width, 3}, "[I, H, W, 3]");
-  check_shape(op, "grad_alpha", grad_alpha, {n, height, width}, "[I, H, W]");
-  check_shape(op, "grad_depth", grad_depth, {n, height, width}, "[I, H, W]");
-  check_shape(op, "grad_features", grad_features, {n, height, width, in.features.size(1)}, "[I, H, W, F]");
-  check_shape(op, "transmittance", transmittance, {n, height, width}, "[I, H, W]");
-  check_shape(op, "last", last, {n, height, width}, "[I, H, W]");
-  for (const Tensor* tensor : {&grad_color, &grad_alpha, &grad_depth, &grad_features, &transmittance})
-    check_dtype(op, "image gradients", *tensor, in.means2d.scalar_type());
-  check_dtype(op, "last", last, ScalarType::Int);
-  check_dtype(op, "state", state, ScalarType::Byte);
-  for (const Tensor* tensor : {&grad_color, &grad_alpha, &grad_depth, &grad_features, &transmittance, &last, &state})
-    check_device(op, "image gradients", *tensor, in.means2d);
+  const ImageGradTensors image{op, grad_color, grad_alpha, grad_depth, grad_features, transmittance, last, state,
+                               in.n_images(), height, width, in.features.size(1), in.means2d};
 
   const auto like = [](const Tensor& tensor) { return torch::stable::new_empty(tensor, tensor.sizes()); };
   Tensor grad_means2d = like(in.means2d), grad_conics = like(in.conics), grad_depths = like(in.depths);
@@ -147,8 +134,7 @@ ProjectedGrads rasterize_projected_backward(
   Tensor grad_in_features = empty(in.features, {in.n_rows(), in.features.size(1) + (absolute ? 2 : 0)});
   TensorWorkspace workspace(in.means2d);
   dispatch_float(op, "means2d", in.means2d, [&]<typename T>() {
-    const RasterImageGrads<T> image_grads{data<T>(grad_color),    data<T>(grad_alpha),    data<T>(grad_depth),
-                                          data<T>(grad_features), data<T>(transmittance), data<int32_t>(last)};
+    const RasterImageGrads<T> image_grads = image.grads<T>();
     RasterSceneGrads<T> grads{};
     grads.opacities = mutable_data<T>(grad_opacities), grads.color = mutable_data<T>(grad_in_color);
     grads.features = mutable_data<T>(grad_in_features), grads.background = mutable_data<T>(grad_background);
@@ -158,8 +144,8 @@ ProjectedGrads rasterize_projected_backward(
       if (in.means2d.is_cuda()) {
         const RasterScene<T> scene = in.scene<T>();
         const cuda::RasterLimits limits{max_pairs, max_entries, max_slots};
-        check_shape(op, "state", state, {cuda::raster_state_bytes(scene, limits)}, "[bytes]");
-        return cuda::raster_backward<T>(scene, image_grads, grads, limits, state.data_ptr(), workspace,
+        check_shape(op, "state", image.state, {cuda::raster_state_bytes(scene, limits)}, "[bytes]");
+        return cuda::raster_backward<T>(scene, image_grads, grads, limits, image.state.data_ptr(), workspace,
                                         current_stream(in.means2d));
       }
     cpu::raster_backward<T>(in.scene<T>(), image_grads, grads, workspace, torch_parallel());

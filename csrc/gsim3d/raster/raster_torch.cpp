@@ -2,6 +2,7 @@
 #include <vector>
 
 #include "gsim3d/raster/raster.h"
+#include "gsim3d/torch/raster_image_grads.h"
 #include "gsim3d/torch/torch_utils.h"
 
 namespace gsim3d::binding {
@@ -132,9 +133,9 @@ Images rasterize_gaussians(const Tensor& means, const Tensor& quats, const Tenso
 
 using SceneGrads = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
-SceneGrads rasterize_gaussians_backward(const Tensor& grad_color_, const Tensor& grad_alpha_, const Tensor& grad_depth_,
-                                        const Tensor& grad_features_, const Tensor& transmittance_, const Tensor& last_,
-                                        const Tensor& state_,
+SceneGrads rasterize_gaussians_backward(const Tensor& grad_color, const Tensor& grad_alpha, const Tensor& grad_depth,
+                                        const Tensor& grad_features, const Tensor& transmittance, const Tensor& last,
+                                        const Tensor& state,
                                         const Tensor& means, const Tensor& quats, const Tensor& scales,
                                         const Tensor& opacities, const Tensor& color, const Tensor& features,
                                         const Tensor& background, const Tensor& viewmats, const Tensor& Ks,
@@ -146,22 +147,9 @@ SceneGrads rasterize_gaussians_backward(const Tensor& grad_color_, const Tensor&
                            viewmats, Ks, image_cloud, cu_rows, width, height, near_plane, cutoff, jacobian};
   given.check_all();
   const SceneTensors in = given.contiguous();
-  const Tensor grad_color = rows_of(grad_color_), grad_alpha = rows_of(grad_alpha_), grad_depth = rows_of(grad_depth_);
-  const Tensor grad_features = rows_of(grad_features_), transmittance = rows_of(transmittance_);
-  const Tensor last = rows_of(last_), state = rows_of(state_);
   const int64_t n = in.n_images();
-  check_shape(op, "grad_color", grad_color, {n, height, width, 3}, "[I, H, W, 3]");
-  check_shape(op, "grad_alpha", grad_alpha, {n, height, width}, "[I, H, W]");
-  check_shape(op, "grad_depth", grad_depth, {n, height, width}, "[I, H, W]");
-  check_shape(op, "grad_features", grad_features, {n, height, width, in.features.size(1)}, "[I, H, W, F]");
-  check_shape(op, "transmittance", transmittance, {n, height, width}, "[I, H, W]");
-  check_shape(op, "last", last, {n, height, width}, "[I, H, W]");
-  for (const Tensor* tensor : {&grad_color, &grad_alpha, &grad_depth, &grad_features, &transmittance})
-    check_dtype(op, "image gradients", *tensor, in.means.scalar_type());
-  check_dtype(op, "last", last, ScalarType::Int);
-  check_dtype(op, "state", state, ScalarType::Byte);
-  for (const Tensor* tensor : {&grad_color, &grad_alpha, &grad_depth, &grad_features, &transmittance, &last, &state})
-    check_device(op, "image gradients", *tensor, in.means);
+  const ImageGradTensors image{op, grad_color, grad_alpha, grad_depth, grad_features, transmittance, last, state,
+                               n, height, width, in.features.size(1), in.means};
 
   const auto like = [](const Tensor& tensor) { return torch::stable::new_empty(tensor, tensor.sizes()); };
   Tensor grad_means = like(in.means), grad_quats = like(in.quats), grad_scales = like(in.scales);
@@ -170,8 +158,7 @@ SceneGrads rasterize_gaussians_backward(const Tensor& grad_color_, const Tensor&
   Tensor grad_viewmats = empty(in.viewmats, {viewmats_grad ? n : 0, 4, 4});
   TensorWorkspace workspace(in.means);
   dispatch_float(op, "means", in.means, [&]<typename T>() {
-    const RasterImageGrads<T> image_grads{data<T>(grad_color),    data<T>(grad_alpha),    data<T>(grad_depth),
-                                          data<T>(grad_features), data<T>(transmittance), data<int32_t>(last)};
+    const RasterImageGrads<T> image_grads = image.grads<T>();
     const RasterSceneGrads<T> grads{mutable_data<T>(grad_means),      mutable_data<T>(grad_quats),
                                     mutable_data<T>(grad_scales),     mutable_data<T>(grad_opacities),
                                     mutable_data<T>(grad_in_color),   mutable_data<T>(grad_in_features),
@@ -181,8 +168,8 @@ SceneGrads rasterize_gaussians_backward(const Tensor& grad_color_, const Tensor&
       if (in.means.is_cuda()) {
         const RasterScene<T> scene = in.scene<T>();
         const cuda::RasterLimits limits{max_pairs, max_entries, max_slots};
-        check_shape(op, "state", state, {cuda::raster_state_bytes(scene, limits)}, "[bytes]");
-        return cuda::raster_backward<T>(scene, image_grads, grads, limits, state.data_ptr(), workspace,
+        check_shape(op, "state", image.state, {cuda::raster_state_bytes(scene, limits)}, "[bytes]");
+        return cuda::raster_backward<T>(scene, image_grads, grads, limits, image.state.data_ptr(), workspace,
                                         current_stream(in.means));
       }
     cpu::raster_backward<T>(in.scene<T>(), image_grads, grads, workspace, torch_parallel());
