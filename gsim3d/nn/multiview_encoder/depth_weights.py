@@ -75,7 +75,7 @@ def load_depth_weights(encoder: Encoder, path: str | Path) -> list[str]:
         if not value.is_floating_point() or not bool(value.isfinite().all()):
             raise InputError(f"{path}: {in_file} is not of finite numbers")
     if missing:
-        raise InputError(f"{path}: has no {missing[0]} (and {len(missing) - 1} more), which {model} needs")
+        raise InputError(f"{path}: lacks {len(missing)} tensors that {model} needs, first {missing[0]}")
     with torch.no_grad():
         for name, (_, value) in found.items():
             own[name].copy_(value)

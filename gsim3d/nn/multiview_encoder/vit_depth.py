@@ -28,7 +28,7 @@ class TimmBackbone(nn.Module):
         super().__init__()
         try:
             timm = importlib.import_module("timm")
-        except ImportError as error:
+        except (ImportError, RuntimeError) as error:  # the latter where torchvision is for another torch
             raise InputError(f"{config.timm}: needs timm ({error}): pip install 'gsim3d[timm]'") from None
         self.config = config
         self.model = timm.create_model(config.timm, pretrained=False, num_classes=0, dynamic_img_size=True)
@@ -146,9 +146,9 @@ class ViTDepth(nn.Module):
 
     def _checked(self, features: Tensor, n_images: int, grid: tuple[int, int]) -> Tensor:
         wanted = (n_images, 4, grid[0] * grid[1], self.config.architecture.token_dim)
-        if tuple(features.shape) != wanted:
+        if tuple(features.shape) != wanted or features.device != self.log_scale.device:
             raise InputError(
-                f"encoder: backbone_features must be {list(wanted)} for this model; got {list(features.shape)}; "
-                "make them with Encoder.backbone_features"
+                f"encoder: backbone_features must be {list(wanted)} on {self.log_scale.device} for this model; got "
+                f"{list(features.shape)} on {features.device}; make them with Encoder.backbone_features"
             )
         return features
