@@ -7,6 +7,7 @@ from contextlib import nullcontext
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from gsim3d.errors import InputError
 from gsim3d.math.rotations import rotation_to_quat
@@ -76,6 +77,21 @@ def _inverse(poses: Tensor) -> Tensor:
     return torch.cat([torch.cat([turn, -turn @ poses[..., :3, 3:]], -1), poses[..., 3:, :]], -2)
 
 
+class _Bounded(torch.autograd.Function):
+    """``x.clamp(lowest, highest)``, whose gradient also reaches what lies outside where a step would bring it back."""
+
+    @staticmethod
+    def forward(ctx, x: Tensor, lowest: Tensor, highest: Tensor) -> Tensor:
+        ctx.save_for_backward(x < lowest, x > highest)
+        return x.clamp(lowest, highest)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None, None]:
+        below, above = ctx.saved_tensors
+        return grad.masked_fill((below & (grad > 0)) | (above & (grad < 0)), 0), None, None
+
+
 class ViTDepth(nn.Module):
     """Views -> depth, opacity and full-resolution features."""
 
@@ -121,8 +137,7 @@ class ViTDepth(nn.Module):
             seen = resize(seen.double(), size)  # half a permille of depth is millimetres: TF32 is too coarse
             log_depth = seen[:, :1] + self.log_scale + unit.log()[:, None, None, None]
             lowest, highest = (bound.double().log()[:, None, None, None] for bound in (views.near, views.far))
-            inside = log_depth.detach().clamp(lowest, highest)
-            depth = (inside + (log_depth - log_depth.detach())).exp()  # gradients also reach what lies outside
+            depth = _Bounded.apply(log_depth, lowest, highest).exp()
             features, opacity_logit = resize(self.feature_head(tokens, grid, read_at), size).tensor_split([-1], 1)
             if self.config.min_confidence > 1:
                 is_low = seen[:, 1:].exp() + 1 < self.config.min_confidence
