@@ -12,11 +12,13 @@ Supported layouts (all keys: docs/reference/data.md):
   genesis      metadata.json with n_steps, n_cams, file_path_template and cam_<j>: as `gsim3d generate` writes
   kubric       cam_<j>/metadata.json with rgba_<t>.png and segmentation_<t>.png: Kubric and MOVi
   transforms   transforms.json of nerfstudio, with a time for every frame
+  hocap        meta.yaml or meta.json, with folders of cameras: HO-Cap
   videos       cameras.json, and for each camera one video <name>.mp4 or one folder <name>/<number>.png or .jpg
 
 Check the contact sheet: in every frame the orange box must enclose the moving bodies, the world axes (x red, y green, z
 blue) must point in consistent directions, and the other cameras (magenta) must be where they are seen. The blue box is
-the bounds of the scene, given or the region that most cameras see; the yellow line is the outline of the masks.
+the bounds of the scene, given or the region that most cameras see; the yellow line is the outline of the masks,
+green dots are points of actors.
   neither axes nor orange box       flipped y and z axes (OpenGL instead of OpenCV), or camera-to-world matrices
   box next to the bodies            intrinsics of another image size, or a principal point not adjusted for cropping
   wrong in one camera only          that camera's pose is wrong, or two cameras are swapped

@@ -20,7 +20,7 @@ TILE = 200, 420  # pixels, smallest and largest height of one frame
 GAP, LINE = 6, 22  # pixels between frames, and height of a line of text
 MAX_CAMERAS, MAX_SCENES = 6, 6  # shown per scene and per data set, evenly spaced
 MAX_COORDINATE = 8000.0  # pixels; projected points are clipped to it
-BOX, BODY, MASK, CAMERA = (255, 220, 60), (0, 140, 255), (0, 235, 255), (255, 90, 255)  # blue, green, red
+BOX, BODY, MASK, CAMERA, ACTOR = (255, 220, 60), (0, 140, 255), (0, 235, 255), (255, 90, 255), (90, 255, 90)  # BGR
 AXES = {"x": (60, 60, 255), "y": (70, 220, 70), "z": (255, 120, 60)}
 INK, PAPER, MISSING = (40, 40, 40), (255, 255, 255), (190, 190, 190)
 EDGE_POINTS = 24
@@ -164,7 +164,7 @@ def contact_sheet(scenes: Sequence[Scene]) -> np.ndarray:
 
     Blue box: the scene's bounds. Orange box: the visual hull of the moving bodies. Arrows: the world's x, y and z axes
     (red, green, blue) at the centre of the lower face of the bounds. Magenta squares: the other cameras. Yellow:
-    outline of the foreground.
+    outline of the foreground. Green dots: points of actors.
 
     Returns:
         uint8 [H, W, 3], BGR.
@@ -184,7 +184,7 @@ def contact_sheet(scenes: Sequence[Scene]) -> np.ndarray:
             blocks.append(np.concatenate(padded, 1)[:, :-GAP])
     legend = (
         "blue box: scene bounds; orange box: visual hull of moving bodies; red, green, blue: world x, y, z; "
-        "magenta: other cameras; yellow: masks"
+        "magenta: other cameras; yellow: masks; green: points of actors, such as hand joints"
     )
     blocks.append(_text(legend))
     width = max(block.shape[1] for block in blocks)
@@ -251,6 +251,10 @@ def _draw_scene(tile: np.ndarray, scene: Scene, cam: int, step: int, zoom: float
         end = line(foot, foot + np.eye(3)[axis] * 0.3 * (high - low).min(), color, 2)
         if end is not None:
             _write(tile, name, (end + 2).tolist(), color)
+    if scene.recording.actions is not None:
+        pixels, depth = project(scene.recording.actions.positions[step], viewmat, K)
+        for pixel in pixels[depth > 1e-3].clip(-MAX_COORDINATE, MAX_COORDINATE).round().astype(int):
+            cv2.circle(tile, pixel.tolist(), 2, ACTOR, -1, cv2.LINE_AA)
     centres, _ = positions_and_axes(viewmats)
     pixels, depth = project(centres, viewmat, K)
     for other in np.flatnonzero(depth > 1e-3):

@@ -10,12 +10,12 @@ import dataclasses
 from pathlib import Path
 from types import ModuleType
 
-from gsim3d.data import colmap, genesis, kubric, transforms, videos
+from gsim3d.data import colmap, genesis, hocap, kubric, transforms, videos
 from gsim3d.data.actions import read_actions
 from gsim3d.data.recording import Problems, Recording, natural_order
 from gsim3d.errors import InputError
 
-LAYOUTS = (kubric, genesis, transforms, videos, colmap)  # in order of precedence
+LAYOUTS = (hocap, kubric, genesis, transforms, videos, colmap)  # in order of precedence
 MAX_DEPTH = 3  # levels of subfolders that are searched
 
 
@@ -30,7 +30,8 @@ def layout_of(folder: str | Path) -> ModuleType:
 def read(folder: Path, problems: Problems) -> Recording:
     """Reads a scene folder of any layout, and its actions."""
     recording = layout_of(folder).read(folder, problems)
-    return dataclasses.replace(recording, actions=read_actions(folder, recording.n_steps, problems))
+    actions = read_actions(folder, recording.n_steps, problems)
+    return recording if actions is None else dataclasses.replace(recording, actions=actions)
 
 
 def find_scenes(root: str | Path) -> list[Path]:

@@ -51,6 +51,7 @@ from gsim3d.train.config import DataConfig, TrainConfig
 from gsim3d.train.log import LOG, Log
 from gsim3d.train.restore import restore
 from tests.compat.release import random_weights, settings_of, small_config, write_release
+from tests.data.made_hocap import write_hocap
 from tests.data.made_scenes import WRITERS, edit_json, make_scene
 from tests.data.made_videos import trimmed, with_gaps, write_plain, write_scene as write_videos
 from tests.data.test_colmap import seen_points, write_colmap
@@ -392,6 +393,11 @@ class Reader:
 _JSON = ("metadata.json", "transforms.json", "cameras.json")
 READERS = {
     **{f"scene_{layout.split()[-1]}": Reader(partial(_write_scene, layout), _read_scene, _JSON) for layout in WRITERS},
+    "scene_hocap": Reader(
+        lambda folder: write_hocap(folder / "data", n_frames=2),
+        lambda folder, what: _read_scene(folder / "data" / "subject_1" / "20231025_165502", what),
+        ("meta.yaml", "extrinsics_20231014.yaml"),
+    ),
     "scene_video": Reader(_write_video_scene, _read_scene, (*_JSON, "cam_0.mp4")),
     "scene_colmap": Reader(
         partial(_write_colmap, binary=True), _read_scene, ("cameras.bin", "images.bin", "points3D.bin")
