@@ -141,5 +141,5 @@ def test_kubric_frame_number_is_the_number_of_its_pose(tmp_path):
 
 
 def test_layout_of_other_folders_is_an_error(tmp_path):
-    with pytest.raises(InputError, match="no metadata.json, transforms.json, cameras.json or sparse/0"):
+    with pytest.raises(InputError, match="no meta.yaml, metadata.json, transforms.json, cameras.json or sparse/0"):
         Scene.open(tmp_path)
