@@ -12,6 +12,8 @@ worlds:
   rigid     rigid bodies are thrown on a round ground
   cloth     soft bodies fall on a cloth with four fixed corners
   push      a round pusher moves one to three bodies over the ground; its positions are recorded (actions.npz)
+  cloth-grip  one or two grippers move a cloth or lay it down; their positions are recorded
+  hands     two hands of 21 keypoints take, carry and put down a body; their keypoints are recorded
 
 examples:
   gsim3d generate elastic --out data/mini                      34 short scenes at 128 pixels
@@ -40,7 +42,7 @@ layout:
                                /inst_<step>.png        0 background, 1 ground, 2 and more: each body, the cloth last
                                /depth_<step>.png       16 bits, 0.1 mm along the optical axis, 0: background (--depth)
   DIR/<object>/<sample>/states.npz                     nodes of each body and of the cloth at every step, metres
-  DIR/<object>/<sample>/actions.npz                    positions of the points of actors at every step, metres (push)
+  DIR/<object>/<sample>/actions.npz                    positions of the points of actors at every step, metres
   DIR/manifest.json                                    options, hashes, rejected draws, machine, versions
   DIR/effects.yaml                                     effects of the scenes (gsim3d plan)
 
@@ -56,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Simulates bodies and records them with calibrated cameras on two rings."
     parser.epilog = EPILOG
     add, lengths = parser.add_argument, {"type": LENGTH, "nargs": 2, "metavar": ("LOW", "HIGH")}
-    add("world", metavar="WORLD", help="elastic, rigid, cloth or push")
+    add("world", metavar="WORLD", help="elastic, rigid, cloth, push, cloth-grip or hands")
     add("--out", metavar="DIR", required=True, help="folder of the data set; created or continued")
     add("--preset", default="mini", help="options to start from: mini (default), published or diverse")
     add("--set", dest="subset", metavar="NAME", help="train (default), or a held-out set, see below")

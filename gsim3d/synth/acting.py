@@ -1,4 +1,7 @@
-"""The world push: a round pusher moves rigid bodies over the ground. Its actor is one point, the pusher's center."""
+"""The world push: a round pusher moves rigid bodies over the ground. Its actor is one point, the pusher's center.
+
+Other worlds with actors: synth.gripping, synth.hands.
+"""
 
 from __future__ import annotations
 
@@ -176,3 +179,21 @@ def _center(body: SceneBody) -> np.ndarray:
 
 def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / max(np.linalg.norm(vector), 1e-9)
+
+
+def smooth_path(poses: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Path through ``poses`` [P, C] that rests at each of them.
+
+    Args:
+        poses: positions and other numbers to interpolate; the first three are a place.
+        times: [T] ascending from 0; the path ends at 1. The time between two places is proportional to their distance.
+
+    Returns:
+        [T, C].
+    """
+    lengths = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1) + 1e-9
+    ends = np.concatenate([[0.0], np.cumsum(lengths)]) / lengths.sum()
+    leg = np.clip(np.searchsorted(ends, times, side="right") - 1, 0, len(lengths) - 1)
+    part = np.clip((times - ends[leg]) / (ends[leg + 1] - ends[leg]), 0, 1)
+    part = (part * part * (3 - 2 * part))[:, None]
+    return poses[leg] + part * (poses[leg + 1] - poses[leg])

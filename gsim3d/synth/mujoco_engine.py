@@ -45,8 +45,15 @@ def simulate(setup: SceneSetup, n_frames: int, fps: float, max_timestep: float) 
     if setup.cloth is not None:
         parts.append(_Cloth(model, data, setup.cloth))
     frames = [[part.rest] for part in parts]
-    for _ in range(1, n_frames):
-        mujoco.mj_step(model, data, substeps)
+    for frame in range(1, n_frames):
+        if setup.grips is None:
+            mujoco.mj_step(model, data, substeps)
+        else:
+            for substep in range(1, substeps + 1):
+                before, after = setup.grips[frame - 1], setup.grips[frame]
+                data.mocap_pos[:] = before + substep / substeps * (after - before)
+                mujoco.mj_step(model, data)
+            mujoco.mj_flex(model, data)
         mujoco.mj_kinematics(model, data)
         for part, nodes in zip(parts, frames):
             nodes.append(part.nodes())
@@ -69,18 +76,25 @@ def model_xml(setup: SceneSetup, timestep: float) -> str:
         bodies.append(_cloth_xml(setup.cloth, contact))
     if setup.ground is not None:
         soft = any(isinstance(body, SoftBody) for body in setup.bodies)
-        height = setup.ground - (CONTACT_RADIUS if soft else 0)
+        held = setup.grips is not None  # its cloth may lie on the ground, and is drawn above it
+        height = setup.ground - (CONTACT_RADIUS if soft else CLOTH_RADIUS / 2 if held else 0)
         bodies.append(f'<geom type="plane" size="9 9 .1" pos="0 0 {height:.9g}" {contact}/>')
     if setup.pusher is not None:
         position, radius = _numbers(setup.pusher.position), f"{setup.pusher.radius:.9g}"
         geom = f'<geom type="sphere" size="{radius}"/>'  # contact parameters are those of the pushed body
         bodies.append(f'<body name="pusher" mocap="true" pos="{position}">{geom}</body>')
+    equality = ""
+    for number, (node, place) in enumerate(zip(setup.cloth.held, setup.grips[0]) if setup.grips is not None else ()):
+        bodies.append(f'<body name="g{number}" mocap="true" pos="{_numbers(place)}"/>')
+        ends = f'body1="g{number}" body2="cloth_{node}" anchor="0 0 0"'
+        equality += f'<connect {ends} {contact} solimp="0.99 0.999 0.001"/>'
     iterations = 50 if setup.cloth is None else 100  # slow convergence of soft bodies on a cloth
     return f"""<mujoco>
   <option timestep="{timestep:.12g}" integrator="discrete" iterations="{iterations}" gravity="0 0 {-GRAVITY}"/>
   <size memory="256M"/>
   <asset>{"".join(assets)}</asset>
   <worldbody>{"".join(bodies)}</worldbody>
+  <equality>{equality}</equality>
 </mujoco>"""
 
 
@@ -120,13 +134,14 @@ def _rigid_xml(index: int, body: RigidBody) -> tuple[str, str]:
 
 def _cloth_xml(cloth: Cloth, contact: str) -> str:
     n = cloth.count
+    pins = f'<pin id="0 {n - 1} {n * (n - 1)} {n * n - 1}"/>' if cloth.held is None else ""
     return f"""<body name="cloth"><flexcomp name="cloth" type="grid" dim="2" count="{n} {n} 1"
       spacing="{cloth.width / (n - 1):.9g} {cloth.width / (n - 1):.9g} 1" pos="0 0 {cloth.height:.9g}"
       mass="{cloth.mass:.9g}" radius="{CLOTH_RADIUS}">
       <elasticity young="{cloth.young:.9g}" poisson="{POISSON}" thickness="{cloth.thickness:.9g}"
                   damping="{cloth.damping:.9g}" elastic2d="both"/>
       <contact selfcollide="none" {contact}/>
-      <pin id="0 {n - 1} {n * (n - 1)} {n * n - 1}"/>
+      {pins}
     </flexcomp></body>"""
 
 

@@ -76,16 +76,17 @@ class RigidBody:
 
 @dataclass(frozen=True)
 class Cloth:
-    """A square cloth with four fixed corners.
+    """A square cloth, flat at time 0, whose corners are fixed or which grippers hold.
 
     Attributes:
         width: width in metres.
-        height: height of the corners in metres.
+        height: height at time 0 in metres.
         count: nodes along a side.
         mass: mass in kg.
         young: Young's modulus in Pa.
         thickness: thickness in metres, for the stiffness.
         damping: damping time in seconds.
+        held: indices of the nodes that grippers hold; None: the four corners are fixed.
     """
 
     width: float
@@ -95,6 +96,7 @@ class Cloth:
     young: float
     thickness: float
     damping: float
+    held: tuple[int, ...] | None = None
 
     def rest_nodes(self) -> np.ndarray:
         """Nodes at time 0 [n, n, 3], world coordinates in metres."""
@@ -124,12 +126,14 @@ class SceneSetup:
         ground: height of the ground in metres; None: no ground.
         cloth: cloth; None: no cloth.
         pusher: kinematic sphere; None: no sphere.
+        grips: positions of the grippers of the cloth at every frame [T, G, 3] in metres; None: no grippers.
     """
 
     bodies: tuple[SoftBody | RigidBody, ...]
     ground: float | None
     cloth: Cloth | None = None
     pusher: Pusher | None = None
+    grips: np.ndarray | None = None
 
 
 class Unstable(Exception):

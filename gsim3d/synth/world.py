@@ -118,6 +118,7 @@ class World(ABC):
 
     name = ""
     engines = tuple(ENGINES)
+    known_objects = OBJECTS
     actors = ()  # types of the actors' points; a scene has the first of them
 
     def check(self) -> None:
@@ -144,8 +145,8 @@ class World(ABC):
             if getattr(self, field) not in allowed:
                 raise InputError(f"{field} must be one of {', '.join(allowed)}; got {getattr(self, field)!r}")
         for name in self.objects:
-            if name not in OBJECTS:
-                known, hint = ", ".join(OBJECTS), did_you_mean(name, OBJECTS)
+            if name not in self.known_objects:
+                known, hint = ", ".join(self.known_objects), did_you_mean(name, self.known_objects)
                 raise InputError(f"object {name!r} is not known; choose from {known}{hint}")
         names = self.object_names()
         repeated = [name for name, count in Counter(names).items() if count > 1]

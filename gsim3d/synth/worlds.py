@@ -12,6 +12,8 @@ from gsim3d.errors import InputError, did_you_mean
 from gsim3d.io.plain import parse_yaml
 from gsim3d.synth import bodies, meshes, shapes
 from gsim3d.synth.acting import Push
+from gsim3d.synth.gripping import ClothGrip
+from gsim3d.synth.hands import Hands
 from gsim3d.synth.scene_setup import Cloth, Material, RigidBody, SoftBody
 from gsim3d.synth.world import TRAIN, World
 
@@ -159,7 +161,14 @@ def _with_tuples(value):
     return tuple(value) if isinstance(value, list) else value
 
 
-WORLDS = {"elastic": Elastic, "rigid": Rigid, "cloth": ClothWorld, "push": Push}
+WORLDS = {
+    "elastic": Elastic,
+    "rigid": Rigid,
+    "cloth": ClothWorld,
+    "push": Push,
+    "cloth-grip": ClothGrip,
+    "hands": Hands,
+}
 _FILE = _with_tuples(parse_yaml((Path(__file__).parent / "assets" / "presets.yaml").read_bytes()))
 PRESETS = _FILE["presets"]  # preset -> world -> options
 HELD_OUT = _FILE["held_out"]  # preset -> set -> world -> options on top of the preset

@@ -56,6 +56,52 @@ def test_pushes_are_long_and_their_pushers_start_clear_of_bodies():
     assert np.median(pushed) > 0.25 and 10 <= scripted < 20
 
 
+@pytest.mark.parametrize("name, n_points", [("cloth-grip", {1, 2}), ("hands", {42})])
+def test_scenes_with_grippers_and_hands_are_read(name, n_points, tmp_path):
+    options = SMALL | {"n_trajectories": 3, "image_size": 48, "n_frames": 5}
+    report, found = generate(tmp_path, name, processes=1, progress=False, **options), set()
+    for folder in report.folders:
+        assert not check_scene(folder).problems
+        actions = Scene.open(folder).recording.actions
+        assert actions.types == build_world(name, "mini", {}).actors[: len(actions.types)]
+        np.testing.assert_array_equal(actions.positions, np.load(folder / "states.npz")["actors"])
+        found.add(len(actions.types))
+    assert found == n_points
+
+
+def test_cloth_follows_its_grippers():
+    world = build_world("cloth-grip", "published", {"n_cams": 2, "n_frames": 10})
+    for sample in range(2):
+        drawn = world.draw("cloth", sample, 0)
+        (cloth, grips), moved = world.simulate(drawn)
+        world._check_trajectory(world.rig(), drawn, moved)
+        held = cloth.nodes.reshape(10, -1, 3)[:, list(drawn.cloth.held)]
+        assert np.abs(held - grips.nodes).max() < 0.02  # inside the grippers
+        assert np.linalg.norm(np.diff(grips.nodes, axis=0), axis=2).sum(0).max() > 0.15
+        assert cloth.nodes[..., 2].min() > -0.01 and np.ptp(cloth.nodes[0, ..., 2]) > 0.2  # it hangs
+
+
+def test_hands_carry_the_body():
+    world = build_world("hands", "published", {"n_cams": 2})
+    lifted = []
+    for sample in range(3):
+        drawn = world.draw("box", sample, 0)
+        (body, hands), (vertices, _) = world.simulate(drawn)
+        assert hands.nodes.shape == (32, 42, 3) and hands.nodes[..., 2].min() > 0
+        axes = body.nodes[:, 1:] - body.nodes[:, :1]
+        np.testing.assert_allclose(axes @ axes.transpose(0, 2, 1), np.broadcast_to(np.eye(3), (32, 3, 3)), atol=1e-9)
+        held = drawn.policy.apart == 0
+        local = np.einsum("tij,tnj->tni", axes, hands.nodes - body.nodes[:, :1])[held]
+        assert len(local) >= 10 and np.linalg.norm(local, axis=2).min() > 0.05
+        wrists = local[:, [0, 21]]
+        np.testing.assert_allclose(wrists, np.broadcast_to(wrists[0], wrists.shape), atol=1e-9)  # fixed to the body
+        bones = np.linalg.norm(np.diff(hands.nodes[:, 1:5], axis=1), axis=2)
+        np.testing.assert_allclose(bones, np.broadcast_to(bones[0], bones.shape), atol=1e-9)
+        assert (vertices[..., 2].min(1) > -0.01).all()
+        lifted.append(np.ptp(vertices[..., 2].mean(1)))
+    assert min(lifted) > 0.1
+
+
 def test_push_refuses_mesh_files(tmp_path):
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n")
     with pytest.raises(InputError, match="push has no mesh files"):
