@@ -41,6 +41,7 @@ class ClothScene(TrueScene):
         Unstable: the solver diverges.
     """
 
+    actor_type = "gripper"
     grip = 1.5 * GRIPPER_RADIUS
 
     def __init__(self, angle: float, goal: np.ndarray):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,13 +12,26 @@ import torch
 from torch import Tensor
 
 from gsim3d.cameras import Cameras, Frames, InputSpec
+from gsim3d.dynamics import FrozenContext
+from gsim3d.dynamics.frozen_context import Reader
 from gsim3d.effects.actors import Actor
 from gsim3d.effects.selection import Selection, newest_mask
-from gsim3d.envs.scenes import FPS, N_PARTICLES, Scenes, TrueScene, padded, task_rig
+from gsim3d.envs.scenes import FPS, N_PARTICLES, Scenes, TrueScene, task_rig
 from gsim3d.errors import InputError
 from gsim3d.nn.multiview_encoder import pixel_rows
+from gsim3d.ops.curve import Pyramid
 from gsim3d.simulator import Simulator
-from gsim3d.state import DYNAMIC, Particles, append_step, concatenate, last_steps, newest_clouds
+from gsim3d.state import (
+    DYNAMIC,
+    FROZEN,
+    Actions,
+    CloudTable,
+    Particles,
+    append_step,
+    concatenate,
+    last_steps,
+    newest_clouds,
+)
 from gsim3d.synth import cameras, render
 from gsim3d.synth.scene_setup import GRAVITY
 
@@ -42,7 +56,7 @@ class ModelState:
 
     Attributes:
         particles: last steps of every scene; ``actor`` marks the particles of actors.
-        actors: float64 [n, A, 3] metres, centers of the actors.
+        actors: float64 [n, L, A, 3] metres, centers of the actors in the last L steps.
     """
 
     particles: Particles
@@ -55,17 +69,23 @@ class Start:
 
     Attributes:
         views: of the last steps, the newest last.
-        scene: the truth, now.
+        actors: [L, A, 3] metres, centers of the actors in these steps.
+        scene: whose bodies these are; its positions are not read.
+        centers: centers of the bodies now [B, 3] in metres. Default: the middles of the boxes around their particles.
     """
 
     views: Sequence[render.View]
+    actors: np.ndarray
     scene: TrueScene
+    centers: np.ndarray | None = None
 
 
 class ModelScenes(Scenes):
     """Scenes side by side in one learned simulator, in one batch.
 
-    Centers of bodies follow the rigid motion that fits their points best, from the truth at the start.
+    Particles of actors move as given. A model with action particles of the scenes' ``actor_type`` also has the actors'
+    centers in its input; for others, the particles are kinematic (:class:`gsim3d.effects.actors.Actor`). Centers of
+    bodies follow the rigid motion that fits their points best.
 
     Args:
         simulator: trained at 12 frames a second, or at an unknown rate.
@@ -100,16 +120,21 @@ class ModelScenes(Scenes):
         self.rig = task_rig(sizes.pop(), inputs.context_views)
         self.device = next(simulator.parameters()).device
         self.state: ModelState | None = None
+        self._type, self._wrap = "", None
 
     def reset(self, started: Mapping[int, TrueScene], rngs: Mapping[int, np.random.Generator]) -> None:
-        self.encode({n: Start([scene.view(self.rig)] * self.history, scene) for n, scene in started.items()}, rngs)
+        starts = {}
+        for number, scene in started.items():
+            actors = np.stack([scene.actors] * self.history)
+            starts[number] = Start([scene.view(self.rig)] * self.history, actors, scene, scene.centers)
+        self.encode(starts, rngs)
 
     @torch.no_grad()
     def encode(self, started: Mapping[int, Start], rngs: Mapping[int, np.random.Generator]) -> None:
         """Replaces scenes, by their numbers; ``rngs`` choose their points.
 
         Raises:
-            InputError: no camera sees the bodies of a scene.
+            InputError: no camera sees a body.
         """
         started = dict(sorted(started.items()))
         frames, labels = self._frames(started)
@@ -123,21 +148,62 @@ class ModelScenes(Scenes):
             particles = dataclasses.replace(particles, body=_body_centers(particles, label))
         if self.plan.spec.dynamics.background == "masked_out":
             particles, label = particles.select_rows(label >= 0), label[label >= 0]
+        of_newest = label[newest_mask(particles)]
         self._merge(particles, started)
-        newest = newest_mask(particles)
-        labels = label[newest].split([particles.clouds.count(q) for q in newest_clouds(particles.clouds)])
+        labels = of_newest.split([particles.clouds.count(q) for q in newest_clouds(particles.clouds)])
         for (number, start), of_scene in zip(started.items(), labels, strict=True):
-            self._choose(number, start.scene, of_scene, rngs[number])
-        chosen = list(started)
-        self._rest[chosen] = self.points()[chosen].double()
+            self._choose(number, start, of_scene, rngs[number])
 
     @torch.no_grad()
     def move(self, velocities: Tensor) -> None:
+        before, actors = self.state.particles, self.state.actors
         moved = velocities / FPS
-        acting = [Actor(of_actor[:, None], ActorRows(number=a)) for a, of_actor in enumerate(moved.unbind(1))]
-        particles = self.state.particles
-        step = self.simulator.rollout(particles, 1, self.plan, actors=acting)[0]
-        self.state = ModelState(append_step(particles, step, self.plan.history), self.state.actors + moved)
+        path = torch.cat([actors, actors[:, -1:] + moved[:, None]], 1)
+        if self._type in self.plan.spec.dynamics.actions:
+            step = self._acted(before, path)
+            newest, known = last_steps(before, 1).means, step.actor.clamp_min(0)
+            means = newest + moved[step.row_scene(), known].float()
+            step = dataclasses.replace(step, means=torch.where((step.actor >= 0)[:, None], means, step.means))
+        else:
+            acting = [Actor(one[:, None], ActorRows(number=number)) for number, one in enumerate(moved.unbind(1))]
+            step = self.simulator.rollout(before, 1, self.plan, actors=acting, wrap=self._wrap)[0]
+        self.state = ModelState(self._reduced(append_step(before, step, self.plan.history)), path[:, 1:])
+
+    def _acted(self, before: Particles, path: Tensor) -> Particles:
+        """The step that follows with action particles on ``path`` [n, L + 1, A, 3]."""
+        table, n_points = before.clouds, path.shape[2]
+        newest = {table.scenes[q]: table.steps[q] for q in newest_clouds(table)}
+        first = tuple(newest[scene] + 2 - path.shape[1] for scene in range(self.count))
+        types = torch.zeros(self.count, n_points, dtype=torch.int64, device=self.device)
+        acting = dataclasses.replace(before, actions=Actions(path.float(), types, (self._type,), first))
+        return dataclasses.replace(self.simulator.rollout(acting, 1, self.plan, wrap=self._wrap)[0], actions=None)
+
+    @torch.no_grad()
+    def repeated(self, state: ModelState, count: int) -> ModelScenes:
+        """``count`` copies of one scene in ``state``, for predictions with different actions.
+
+        A static background that the model computes once a rollout is shared by all copies; else all particles in the
+        network's input are copied.
+
+        Raises:
+            InputError: these are several scenes.
+        """
+        if self.count != 1:
+            raise InputError(f"one scene can be repeated; got {self.count}")
+        copies, particles = copy.copy(self), state.particles
+        if self.simulator.config.dynamics.is_asymmetric:
+            newest = last_steps(particles, 1)
+            static = self.simulator.dynamics.remember(newest.select_rows(newest.activity == FROZEN))
+            shared = SharedContext(**vars(static))
+            copies._wrap = lambda predict: lambda history, background, **options: predict(history, shared, **options)
+            moving = particles.activity != FROZEN
+            copies._rows = (newest.activity != FROZEN).cumsum(0)[self._rows] - 1
+            particles = particles.select_rows(moving)
+        copies.count, copies.state = count, ModelState(_tiled(particles, count), state.actors.expand(count, -1, -1, -1))
+        for name in ("_rows", "_members", "_rest", "_centers"):
+            value = getattr(copies, name)
+            setattr(copies, name, value.expand(count, *value.shape[1:]))
+        return copies
 
     @torch.no_grad()
     def throw(self, velocities: Tensor) -> None:
@@ -154,10 +220,10 @@ class ModelScenes(Scenes):
         fields = {"means": means}
         if particles.velocity is not None:
             fields["velocity"] = torch.where(moves, (velocity - fall / FPS) / FPS, particles.velocity)
-        self.state = ModelState(dataclasses.replace(particles, **fields), self.state.actors)
+        self.state = dataclasses.replace(self.state, particles=dataclasses.replace(particles, **fields))
 
     def actors(self) -> Tensor:
-        return self.state.actors
+        return self.state.actors[:, -1]
 
     def centers(self) -> Tensor:
         return self.centers_of(self.points())
@@ -206,43 +272,75 @@ class ModelScenes(Scenes):
     def _gripped(self, particles: Particles, actor: Tensor, started: Mapping[int, Start]) -> Tensor:
         """Actor of each particle [N]; those of bodies in a gripper belong to it."""
         for number, start in started.items():
-            for a, center in enumerate(start.scene.actors if start.scene.grip else ()):
+            for a, center in enumerate(start.actors[-1] if start.scene.grip else ()):
                 away = particles.means - torch.from_numpy(center).to(particles.means)
                 held = (away.norm(dim=1) < start.scene.grip) & (particles.row_scene() == number)
                 actor = torch.where(held & (particles.activity == DYNAMIC), a, actor)
         return actor
 
+    def _reduced(self, particles: Particles) -> Particles:
+        """``particles`` without those that the network does not see: the older background of a relightable model."""
+        if not self.simulator.config.dynamics.is_relightable:
+            return particles
+        return particles.select_rows((particles.activity != FROZEN) | newest_mask(particles))
+
     def _merge(self, particles: Particles, started: Mapping[int, Start]) -> None:
         """Replaces the scenes ``started`` of the state by ``particles``."""
-        actors = {number: torch.from_numpy(start.scene.actors) for number, start in started.items()}
+        particles, length = self._reduced(particles), self.plan.history
         if self.state is None or len(started) == self.count:
             self._rows = torch.zeros(self.count, N_PARTICLES, dtype=torch.int64, device=self.device)
             self._rest = torch.zeros(self.count, N_PARTICLES, 3, dtype=torch.float64, device=self.device)
             self._members = torch.zeros(self.count, self.most_bodies, N_PARTICLES, device=self.device).double()
             self._centers = torch.full((self.count, self.most_bodies, 3), torch.nan, device=self.device).double()
-            self.state = ModelState(particles, torch.stack(list(actors.values())).to(self.device))
-            return
-        old = self.state.particles
-        kept = old.select_clouds([q for q, scene in enumerate(old.clouds.scenes) if scene not in started])
-        positions = self.state.actors.clone()
-        for number, of_scene in actors.items():
-            positions[number] = of_scene
-        self.state = ModelState(concatenate([kept, particles]), positions)
+            actors = next(iter(started.values())).actors
+            positions = torch.zeros(self.count, length, *actors.shape[1:], device=self.device).double()
+            self._type = next(iter(started.values())).scene.actor_type
+        else:
+            old, positions = self.state.particles, self.state.actors.clone()
+            kept = old.select_clouds([q for q, scene in enumerate(old.clouds.scenes) if scene not in started])
+            particles = concatenate([kept, particles])
+        for number, start in started.items():
+            before = [start.actors[:1]] * max(0, length - len(start.actors))
+            positions[number] = torch.from_numpy(np.concatenate([*before, start.actors])[-length:]).to(self.device)
+        self.state = ModelState(particles, positions)
 
-    def _choose(self, number: int, scene: TrueScene, labels: Tensor, rng: np.random.Generator) -> None:
+    def _choose(self, number: int, start: Start, labels: Tensor, rng: np.random.Generator) -> None:
         """Chooses the points of a scene, an equal share of each body; ``labels`` are of its newest particles."""
-        share = -(-N_PARTICLES // scene.n_bodies)
-        rows, members = [], []
-        for body in range(scene.n_bodies):
+        n_bodies, means = start.scene.n_bodies, last_steps(self.state.particles, 1)
+        share = -(-N_PARTICLES // n_bodies)
+        means = means.means[means.cu_rows[number] : means.cu_rows[number + 1]]
+        rows, members, middles = [], [], []
+        for body in range(n_bodies):
             known = (labels == body).nonzero()[:, 0]
             if not len(known):
                 raise InputError(f"body {body} of scene {number} is not seen by any camera; reset with another seed")
             rows.append(known[torch.from_numpy(rng.integers(len(known), size=share)).to(self.device)])
             members += [body] * share
+            middles.append((means[known].amin(0) + means[known].amax(0)) / 2)
         self._rows[number] = torch.cat(rows)[:N_PARTICLES]
+        self._rest[number] = means[self._rows[number]].double()
         of_points = torch.tensor(members[:N_PARTICLES], device=self.device)
         self._members[number] = of_points == torch.arange(self.most_bodies, device=self.device)[:, None]
-        self._centers[number] = torch.from_numpy(padded(scene.centers, self.most_bodies)).to(self.device)
+        centers = torch.stack(middles).double() if start.centers is None else torch.from_numpy(start.centers)
+        self._centers[number, :n_bodies], self._centers[number, n_bodies:] = centers.to(self.device), torch.nan
+
+
+class SharedContext(FrozenContext):
+    """A static background of scene 0 that all scenes read."""
+
+    def readers(self, pyramid: Pyramid, particles: Particles) -> list[Reader]:
+        first = torch.zeros_like(particles.cloud_scene)
+        return super().readers(pyramid, dataclasses.replace(particles, cloud_scene=first))
+
+
+def _tiled(particles: Particles, count: int) -> Particles:
+    """``count`` copies of the one scene of ``particles``."""
+    table = particles.clouds
+    scenes, steps = [number for number in range(count) for _ in table.scenes], table.steps * count
+    made = CloudTable.make(table.counts * count, scenes, steps, particles.cu_rows.device)
+    fields = {name: torch.cat([value] * count) for name, value in particles.row_fields().items()}
+    origin = particles.origin[table.scenes[0]].expand(count, 3)
+    return dataclasses.replace(particles, origin=origin).with_clouds(made, **fields)
 
 
 def _cameras(rig: cameras.Rig, image_cloud: Tensor) -> Cameras:

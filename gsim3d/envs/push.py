@@ -35,6 +35,8 @@ class PushScene(TrueScene):
         simulation: the bodies and the pusher.
     """
 
+    actor_type = "pusher"
+
     def __init__(self, bodies: Sequence[pushing.SceneBody], pusher: np.ndarray, goal: np.ndarray):
         surface, self._sphere = pushing.pusher_surface()
         super().__init__(goal, [*(body.surface for body in bodies), surface], len(bodies))

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsim3d.envs.push import MAX_SPEED, bounded_velocity
+from gsim3d.envs.model import ModelScenes, ModelState
+from gsim3d.envs.push import MAX_SPEED, PushToGoal, bounded_velocity
 from gsim3d.synth.pushing import PUSHER_RADIUS, SIZE, PushSimulation, PushState
 from gsim3d.synth.scene_setup import Unstable
 
@@ -55,6 +56,27 @@ class TrueDynamics:
                 continue
         simulation.restore(state)
         return PushStates(torch.from_numpy(centers), torch.from_numpy(pusher))
+
+
+class ModelDynamics:
+    """Dynamics for planners: a learned simulator, all sequences in one batch.
+
+    Args:
+        scenes: one scene; calls leave it as it is.
+    """
+
+    def __init__(self, scenes: ModelScenes):
+        self.scenes = scenes
+
+    def __call__(self, state: ModelState, actions: Tensor) -> PushStates:
+        """Positions after each of ``actions`` [K, H, 2], m/s, from ``state``."""
+        copies = self.scenes.repeated(state, len(actions))
+        centers, pusher = [], []
+        for action in actions.to(copies.device, torch.float64).unbind(1):
+            PushToGoal.act(copies, action)
+            centers.append(copies.centers()[:, 0, :2])
+            pusher.append(copies.actors()[:, 0, :2])
+        return PushStates(torch.stack(centers, 1), torch.stack(pusher, 1))
 
 
 @dataclass(frozen=True)

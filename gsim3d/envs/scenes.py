@@ -31,9 +31,11 @@ class TrueScene(ABC):
         goal: [2] metres.
         surfaces: of the bodies, then of the actors.
         n_bodies: number of bodies.
+        actor_type: type of the points of actors, for models with action particles.
         grip: metres; particles of bodies nearer to an actor's center move with it.
     """
 
+    actor_type = ""
     grip = 0.0
 
     def __init__(self, goal: np.ndarray, surfaces: Sequence[render.Surface], n_bodies: int):

@@ -8,8 +8,10 @@ import pytest
 import torch
 
 from gsim3d.cameras import InputSpec
+from gsim3d.effects.spec import DynamicsEffects, EffectsSpec
 from gsim3d.errors import InputError
 from gsim3d.priors import InertiaConfig, SegmentationConfig
+from gsim3d.state import DYNAMIC, FROZEN, last_steps
 from tests.test_simulator import CONFIG, awake, make_simulator
 
 gymnasium = pytest.importorskip("gymnasium", reason="needs gymnasium: pip install 'gsim3d[envs]'")
@@ -17,7 +19,9 @@ pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'gsim3d[envs]'")
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 from gymnasium.vector import AutoresetMode  # noqa: E402
 
+from gsim3d.envs.model import ModelScenes, Start  # noqa: E402
 from gsim3d.envs.push import FPS, MAX_SPEED, PushClear, PushToGoal  # noqa: E402
+from gsim3d.envs.push_planning import ModelDynamics  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 TASKS = ("PushToGoal", "PushClear", "ThrowToTarget", "ClothCover")
@@ -182,3 +186,78 @@ def test_disabled_waits_for_a_mask(model):
 def test_seeds_decide_all_bits(model):
     runs = [episode_starts(make_vec("PushClear", 2, backend="model", model=model), seed, 3) for seed in (4, 4, 5)]
     assert torch.equal(runs[0][-1][0], runs[1][-1][0]) and not torch.equal(runs[0][-1][0], runs[2][-1][0])
+
+
+def scenes_of(count=1, effects=None, **dynamics):
+    """A tiny simulator's scenes of PushToGoal."""
+    config = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, max_step=0.02, **dynamics))
+    simulator = awake(make_simulator(config))
+    simulator.effects = effects or EffectsSpec()
+    scenes, rngs = ModelScenes(simulator, count, 1, 16), {n: np.random.default_rng(n) for n in range(count)}
+    scenes.reset({n: PushToGoal.draw(rngs[n]) for n in range(count)}, rngs)
+    return scenes
+
+
+@pytest.mark.parametrize("background", ["symmetric", "relightable", "asymmetric"])
+def test_copies_of_a_scene_predict_what_it_does(background):
+    scenes = scenes_of(background=background, norm="layer")
+    given = actions(6, 1).unflatten(0, (3, 2))
+    states = ModelDynamics(scenes)(scenes.state, given)
+    start = scenes.state
+    copies = scenes.repeated(start, 3).state.particles
+    n_frozen = (copies.activity == FROZEN).sum()
+    newest = last_steps(start.particles, 1).activity == FROZEN
+    all_frozen = (start.particles.activity == FROZEN).sum()
+    assert n_frozen == {"symmetric": 3 * all_frozen, "relightable": 3 * newest.sum(), "asymmetric": 0}[background]
+    assert newest.any() and (all_frozen == newest.sum()) == (background == "relightable")
+    for k in range(3):
+        scenes.state = start
+        for step in range(2):
+            PushToGoal.act(scenes, given[k : k + 1, step])
+            assert (scenes.centers()[0, 0, :2] - states.centers[k, step]).abs().max() < 1e-5
+            assert (scenes.actors()[0, 0, :2] - states.pusher[k, step]).abs().max() < 1e-12
+    assert (states.centers[0, 1] - states.centers[1, 1]).abs().max() > 1e-7
+
+
+def test_relightable_scenes_drop_only_what_the_network_does_not_see():
+    scenes, moved = scenes_of(background="relightable", norm="layer"), []
+    for reduced in (ModelScenes._reduced.__get__(scenes), lambda particles: particles):
+        scenes._reduced = reduced
+        scenes.reset({0: PushToGoal.draw(np.random.default_rng(0))}, {0: np.random.default_rng(1)})
+        PushToGoal.act(scenes, actions(1))
+        PushToGoal.act(scenes, actions(1, 1))
+        moved.append((scenes.state.particles.n_rows, scenes.centers()))
+    assert moved[0][0] < moved[1][0] and (moved[0][1] - moved[1][1]).abs().max() < 1e-6
+
+
+def test_models_with_action_particles_read_the_actors_path():
+    effects = EffectsSpec(DynamicsEffects(actions=("pusher",)))
+    scenes = scenes_of(2, effects, actions=("pusher",))
+    before, start = scenes.state, last_steps(scenes.state.particles, 1)
+    ends = []
+    for seed in (0, 1):
+        scenes.state = before
+        given = actions(2, seed)
+        given[0] = 0.25
+        PushToGoal.act(scenes, given)
+        PushToGoal.act(scenes, given)
+        ends.append(newest := last_steps(scenes.state.particles, 1))
+        pusher = newest.actor == 0
+        path = (2 * given / FPS)[newest.row_scene()].float()
+        assert pusher.any() and (newest.means - start.means)[pusher][:, :2].sub(path[pusher]).abs().max() < 1e-6
+        assert newest.actions is None
+    first, bodies = ends[0].row_scene() == 0, ends[0].actor < 0
+    assert torch.allclose(ends[0].means[first], ends[1].means[first], atol=1e-6)
+    assert (ends[0].means - ends[1].means)[~first & bodies].abs().max() > 1e-6
+    known = scenes.state.actors[1, -3:, 0]
+    assert torch.allclose(known.diff(dim=0)[:, :2], given[1] / FPS)
+
+
+def test_without_known_centers_they_are_the_middles_of_the_particles():
+    scenes = scenes_of()
+    truth = PushToGoal.draw(np.random.default_rng(0))
+    views, path = [truth.view(scenes.rig)] * 4, np.stack([truth.actors] * 4)
+    scenes.encode({0: Start(views, path, truth)}, {0: np.random.default_rng(0)})
+    particles = last_steps(scenes.state.particles, 1)
+    body = particles.means[(particles.activity == DYNAMIC) & (particles.actor < 0)]
+    assert torch.allclose(scenes.centers()[0, 0].float(), (body.amin(0) + body.amax(0)) / 2, atol=1e-5)

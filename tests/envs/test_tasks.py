@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 from gsim3d.envs import ClothCover, ThrowToTarget  # noqa: E402
 from gsim3d.envs.cloth import HIGHEST, LOWEST, WORKSPACE  # noqa: E402
-from gsim3d.envs.model import ModelScenes  # noqa: E402
+from gsim3d.envs.model import ModelScenes, Start  # noqa: E402
 from gsim3d.envs.scenes import FPS  # noqa: E402
 from gsim3d.state import DYNAMIC  # noqa: E402
 from gsim3d.synth.scene_setup import GRAVITY  # noqa: E402
@@ -87,7 +87,7 @@ def test_particles_in_a_gripper_become_its_actor():
     particles = scenes.state.particles
     row = (particles.activity == DYNAMIC).nonzero()[0, 0]
     particles.means[row] = torch.from_numpy(scene.actors[1]).float() + 0.01
-    found = scenes._gripped(particles, torch.full_like(particles.actor, -1), {0: type("Start", (), {"scene": scene})})
+    found = scenes._gripped(particles, torch.full_like(particles.actor, -1), {0: Start([], scene.actors[None], scene)})
     assert found[row] == 1 and (found[particles.activity != DYNAMIC] == -1).all()
 
 
