@@ -1,7 +1,9 @@
 """Environments in a learned simulator, single and side by side, of random weights."""
 
 import dataclasses
+import importlib
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -261,3 +263,18 @@ def test_without_known_centers_they_are_the_middles_of_the_particles():
     particles = last_steps(scenes.state.particles, 1)
     body = particles.means[(particles.activity == DYNAMIC) & (particles.actor < 0)]
     assert torch.allclose(scenes.centers()[0, 0].float(), (body.amin(0) + body.amax(0)) / 2, atol=1e-5)
+
+
+def test_benchmark_plans_in_a_model_from_images_of_the_truth(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "tools" / "bench"))
+    bench = importlib.import_module("push_planning")
+    monkeypatch.setitem(bench.SETTINGS, "samples", 3)
+    monkeypatch.setitem(bench.SETTINGS, "iterations", 1)
+    scenes, env = scenes_of(), gymnasium.make("gsim3d/PushToGoal-v0", max_episode_steps=6)
+    episode = bench.run("model", env, 1000, scenes, 2)
+    assert episode["steps"] == 6 and len(episode["plan_seconds"]) == len(episode["errors"]) == 2
+    assert np.array(episode["errors"]).shape == (2, 2, 8) and np.isfinite(episode["errors"]).all()
+    found = bench.summary([episode, bench.run("zero", env, 1000, None, None)])
+    bench.show("model", found)
+    assert found["solved"] == 0 and len(found["median_errors"]["model"]) == 8
+    assert "solved 0 of 2 (95 %: 0% to 66%)" in capsys.readouterr().out

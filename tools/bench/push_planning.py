@@ -1,9 +1,13 @@
-"""Success of agents on PushToGoal: random, zero, and planners in MuJoCo itself, on 50 fixed seeds.
+"""Success of agents on PushToGoal: random, zero, and planners in MuJoCo and in a simulator, on 50 fixed seeds.
 
-python tools/bench/push_planning.py [--agents zero random mppi cem] [--seeds 50] [--out docs/results/push_planning.json]
+python tools/bench/push_planning.py [--agents zero random mppi cem model] [--model PATH] [--device cuda] [--seeds 50]
+    [--out docs/results/push_planning.json]
 
-Planners: K 64 sequences of H 8 actions, 3 iterations, replanned every 4 steps. Printed: solved episodes with the 95 %
-Wilson interval, the median of the last distance to the goal, steps of solved episodes and seconds of a plan.
+Planners: K 64 sequences of H 8 actions, 3 iterations, replanned every 4 steps. Agent ``model`` is MPPI in the simulator
+``--model``, which acts in MuJoCo: before each plan it encodes images of the last steps, with masks of the body and the
+pusher, and the pusher's positions. Printed: solved episodes with the 95 % Wilson interval, the median of the last
+distance to the goal, steps of solved episodes, seconds of a plan, and for ``model`` predicted steps a second and the
+median error of the body's center at each of the H steps of its plans, beside that of a body that does not move.
 """
 
 from __future__ import annotations
@@ -15,6 +19,7 @@ import os
 import statistics
 import sys
 import time
+from collections import deque
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -24,22 +29,74 @@ import numpy as np  # noqa: E402
 import torch  # noqa: E402
 
 import gsim3d.envs  # noqa: E402, F401
-from gsim3d.envs.push_planning import GoalCost, TrueDynamics, action_bounds  # noqa: E402
-from gsim3d.planning import CEM, MPPI  # noqa: E402
+from gsim3d import Simulator  # noqa: E402
+from gsim3d.envs.model import ModelScenes, Start  # noqa: E402
+from gsim3d.envs.push import PushToGoal  # noqa: E402
+from gsim3d.envs.push_planning import GoalCost, ModelDynamics, TrueDynamics, action_bounds  # noqa: E402
+from gsim3d.planning import CEM, MPPI, Plan  # noqa: E402
 
 FIRST_SEED = 1000
 EVERY = 4  # steps between plans
-PLANNERS = {"mppi": MPPI, "cem": CEM}
+PLANNERS = {"mppi": MPPI, "cem": CEM, "model": MPPI}
 SETTINGS = {"horizon": 8, "samples": 64, "iterations": 3, "noise": 0.3}
 
 
-def run(agent: str, env: gymnasium.Env, seed: int) -> dict:
-    """One episode: whether it was solved, the last distance, steps, and seconds of each plan."""
+class InTruth:
+    """Plans in MuJoCo."""
+
+    def __init__(self, planner: type, task: PushToGoal, seed: int):
+        self.task, self.dynamics = task, TrueDynamics(task.simulation)
+        self.planner = planner(
+            self.dynamics, GoalCost(torch.from_numpy(task.goal)), *action_bounds(), seed=seed, **SETTINGS
+        )
+
+    def observe(self) -> None:
+        """Sees the task after a step."""
+
+    def plan(self, executed: int) -> Plan:
+        return self.planner.plan(self.task.simulation.state(), executed)
+
+
+class InModel:
+    """Plans in a simulator, from images.
+
+    Attributes:
+        errors: of each plan, of the body's center [H] in metres, and of a body that does not move.
+    """
+
+    def __init__(self, scenes: ModelScenes, task: PushToGoal, seed: int, chunk: int | None):
+        self.task, self.scenes, self.seed, self.errors = task, scenes, seed, []
+        self.dynamics, cost = ModelDynamics(scenes), GoalCost(torch.from_numpy(task.goal).to(scenes.device))
+        self.planner = MPPI(self.dynamics, cost, *action_bounds(), seed=seed, chunk=chunk, **SETTINGS)
+        first = (task.scenes.all[0].view(scenes.rig), task.scenes.all[0].actors)
+        self.seen = deque([first] * scenes.history, maxlen=scenes.history)  # at rest before the start
+
+    def observe(self) -> None:
+        """Sees the task after a step."""
+        truth = self.task.scenes.all[0]
+        self.seen.append((truth.view(self.scenes.rig), truth.actors))
+
+    def plan(self, executed: int) -> Plan:
+        views, actors = zip(*self.seen, strict=True)
+        start = Start(views, np.stack(actors), self.task.scenes.all[0])
+        self.scenes.encode({0: start}, {0: np.random.default_rng(self.seed)})
+        return self.planner.plan(self.scenes.state, executed)
+
+    def compare(self, plan: Plan) -> None:
+        """Adds the errors of a plan."""
+        simulation, actions = self.task.simulation, plan.actions[None]
+        at = torch.from_numpy(simulation.centers[0, :2])
+        truth = TrueDynamics(simulation)(simulation.state(), actions).centers[0]
+        predicted = self.dynamics(self.scenes.state, actions).centers[0].cpu()
+        self.errors.append([(one - truth).norm(dim=1).tolist() for one in (predicted, at)])
+
+
+def run(agent: str, env: gymnasium.Env, seed: int, scenes: ModelScenes | None, chunk: int | None) -> dict:
+    """One episode: whether it was solved, the last distance, steps, seconds of each plan, and errors of the model."""
     _, info = env.reset(seed=seed)
-    task, rng, times = env.unwrapped, np.random.default_rng(seed), []
+    task, rng, times, planner = env.unwrapped, np.random.default_rng(seed), [], None
     if agent in PLANNERS:
-        cost = GoalCost(torch.from_numpy(task.goal))
-        planner = PLANNERS[agent](TrueDynamics(task.simulation), cost, *action_bounds(), seed=seed, **SETTINGS)
+        planner = InModel(scenes, task, seed, chunk) if agent == "model" else InTruth(PLANNERS[agent], task, seed)
     ended, steps, reward, actions = False, 0, 0.0, []
     while not ended:
         if agent == "zero":
@@ -49,15 +106,21 @@ def run(agent: str, env: gymnasium.Env, seed: int) -> dict:
             actions = [rng.uniform(low, high).astype(np.float32)]
         else:
             start = time.perf_counter()
-            plan = planner.plan(task.simulation.state(), executed=len(actions))
+            plan = planner.plan(len(actions))
             times.append(time.perf_counter() - start)
+            if agent == "model":
+                planner.compare(plan)
             actions = list(plan.actions[:EVERY].numpy().astype(np.float32))
         for action in actions:
             _, reward, terminated, truncated, info = env.step(action)
             steps, ended = steps + 1, terminated or truncated
+            if planner is not None:
+                planner.observe()
             if ended:
                 break
-    return {"seed": seed, "solved": info["is_success"], "distance": -reward, "steps": steps, "plan_seconds": times}
+    errors = planner.errors if agent == "model" else []
+    found = {"seed": seed, "solved": info["is_success"], "distance": -reward, "steps": steps}
+    return {**found, "plan_seconds": times, "errors": errors}
 
 
 def wilson(solved: int, count: int, z: float = 1.959964) -> tuple[float, float]:
@@ -65,48 +128,67 @@ def wilson(solved: int, count: int, z: float = 1.959964) -> tuple[float, float]:
     share, spread = solved / count, z * z / count
     middle = (share + spread / 2) / (1 + spread)
     half = z / (1 + spread) * math.sqrt(share * (1 - share) / count + spread / (4 * count))
-    return middle - half, middle + half
+    return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def summary(episodes: list[dict]) -> dict:
+    """Numbers of an agent."""
+    solved = sum(episode["solved"] for episode in episodes)
+    steps = [episode["steps"] for episode in episodes if episode["solved"]]
+    times = [seconds for episode in episodes for seconds in episode["plan_seconds"]]
+    errors = np.array([plan for episode in episodes for plan in episode["errors"]])  # [plans, 2, H]
+    middle = np.median(errors, 0).tolist() if len(errors) else []
+    predicted = SETTINGS["horizon"] * (SETTINGS["samples"] * SETTINGS["iterations"] + 1)  # MPPI also costs its mean
+    return {
+        "solved": solved,
+        "episodes": len(episodes),
+        "interval": wilson(solved, len(episodes)),
+        "median_distance": statistics.median(episode["distance"] for episode in episodes),
+        "median_steps": statistics.median(steps) if steps else None,
+        "median_plan_seconds": statistics.median(times) if times else None,
+        "steps_a_second": predicted / statistics.median(times) if times else None,
+        "median_errors": dict(zip(("model", "rest"), middle, strict=False)),
+        "runs": [{k: v for k, v in one.items() if k not in ("plan_seconds", "errors")} for one in episodes],
+    }
+
+
+def show(agent: str, found: dict) -> None:
+    """Prints the numbers of an agent."""
+    low, high = found["interval"]
+    text = f"{agent:7} solved {found['solved']} of {found['episodes']} (95 %: {low:.0%} to {high:.0%}), "
+    text += f"last distance {found['median_distance']:.3f} m"
+    if found["median_steps"] is not None:
+        text += f", {found['median_steps']:.0f} steps"
+    if found["median_plan_seconds"] is not None:
+        text += f", {found['median_plan_seconds']:.2f} s a plan, {found['steps_a_second']:.0f} steps a second"
+    for what, errors in found["median_errors"].items():
+        text += f"\n        error of {what}: " + " ".join(f"{100 * error:.1f}" for error in errors) + " cm"
+    print(text, flush=True)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0], allow_abbrev=False)
-    parser.add_argument(
-        "--agents", nargs="+", choices=("zero", "random", *PLANNERS), default=["zero", "random", *PLANNERS]
-    )
+    parser.add_argument("--agents", nargs="+", choices=("zero", "random", *PLANNERS), help="default: all that can run")
+    parser.add_argument("--model", help="simulator of the agent model: a checkpoint, or a shipped name")
+    parser.add_argument("--device", default="cpu", help="of the simulator (default %(default)s)")
+    parser.add_argument("--chunk", type=int, help="largest number of sequences that the simulator predicts together")
     parser.add_argument("--seeds", type=int, default=50, help="number of episodes (default %(default)s)")
     parser.add_argument("--out", type=Path, help="file for all numbers")
     args = parser.parse_args()
+    agents = args.agents or ["zero", "random", "mppi", "cem", *["model"] * (args.model is not None)]
+    if "model" in agents and args.model is None:
+        parser.error("the agent model needs --model PATH")
+    scenes = args.model and ModelScenes(Simulator.from_pretrained(args.model, device=args.device), 1, 1)
     env, found = gymnasium.make("gsim3d/PushToGoal-v0"), {}
-    for agent in args.agents:
-        episodes = [run(agent, env, FIRST_SEED + number) for number in range(args.seeds)]
-        solved = sum(episode["solved"] for episode in episodes)
-        low, high = wilson(solved, len(episodes))
-        distance = statistics.median(episode["distance"] for episode in episodes)
-        steps = [episode["steps"] for episode in episodes if episode["solved"]]
-        times = [seconds for episode in episodes for seconds in episode["plan_seconds"]]
-        found[agent] = {
-            "solved": solved,
-            "episodes": len(episodes),
-            "interval": [low, high],
-            "median_distance": distance,
-            "median_steps": statistics.median(steps) if steps else None,
-            "median_plan_seconds": statistics.median(times) if times else None,
-            "runs": [{k: v for k, v in episode.items() if k != "plan_seconds"} for episode in episodes],
-        }
-        print(
-            f"{agent:7} solved {solved} of {len(episodes)} (95 %: {low:.0%} to {high:.0%}), "
-            f"last distance {distance:.3f} m"
-            + (f", {statistics.median(steps):.0f} steps" if steps else "")
-            + (f", {statistics.median(times):.2f} s a plan" if times else ""),
-            flush=True,
-        )
+    for agent in agents:
+        seeds = range(FIRST_SEED, FIRST_SEED + args.seeds)
+        found[agent] = summary([run(agent, env, seed, scenes, args.chunk) for seed in seeds])
+        show(agent, found[agent])
     if args.out:
-        about = {
-            "task": "PushToGoal",
-            "first_seed": FIRST_SEED,
-            "every": EVERY,
-            **SETTINGS,
-        }
+        about = {"task": "PushToGoal", "first_seed": FIRST_SEED, "every": EVERY, **SETTINGS}
+        if args.model:
+            device = torch.cuda.get_device_name() if args.device == "cuda" else args.device
+            about |= {"model": args.model, "device": device}
         args.out.write_text(json.dumps({"about": about, "agents": found}, indent=1) + "\n")
 
 
