@@ -261,7 +261,7 @@ class Simulator(nn.Module):
         Except for edits, all steps have the particles of the newest step of ``state``, in the same order.
 
         Args:
-            state: last steps of every scene.
+            state: last steps of every scene; ``state.actions`` are known motions of actors.
             n_steps: number of steps to predict.
             plan: see :meth:`step`.
             plans: one plan per scene, instead of ``plan``. Scenes with equal plans are batched; each result equals that

@@ -20,9 +20,7 @@ from gsim3d.synth.shapes import icosphere
 from gsim3d.synth.world import SceneDraw, World
 
 SIDES = ("left", "right")
-FINGERS = ("thumb", "index", "middle", "ring", "little")
-JOINTS = ("wrist", *(f"{finger}_{number}" for finger in FINGERS for number in range(1, 5)))
-TYPES = tuple(f"{side}_{joint}" for side in SIDES for joint in JOINTS)
+TYPES = tuple(f"{side}_{joint}" for side in SIDES for joint in range(21))  # as those of HO-Cap
 # Of each finger: base (forward, up) from the wrist, lengths of its three bones in metres, direction (rad from forward).
 SHAPE = {
     "thumb": ((0.030, 0.035), (0.040, 0.032, 0.026), 0.75),

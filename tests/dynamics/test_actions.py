@@ -12,6 +12,7 @@ from gsim3d.effects.spec import AppearanceEffects, DynamicsEffects, EffectsSpec,
 from gsim3d.errors import InputError
 from gsim3d.io import read_particles, write_particles
 from gsim3d.presets import ModelConfig
+from gsim3d.pretrained.loading import with_weights
 from gsim3d.priors import InertiaConfig
 from gsim3d.simulator import Simulator
 from gsim3d.state import ASLEEP, DYNAMIC
@@ -225,12 +226,18 @@ def test_wrong_actions_are_refused():
         dataclasses.replace(MODELS["explicit"].dynamics, actions=TYPES)
 
 
-def test_weights_without_embeddings_serve_plans_without_actions(tmp_path):
+def test_weights_without_embeddings_serve_plans_without_actions():
     simulator, state, _ = setting()
-    simulator.effects = EffectsSpec()
-    simulator.absent = frozenset(simulator.plan(EffectsSpec()).unused)
+    weights = simulator.state_dict()
+    plain = {k: v for k, v in weights.items() if not k.startswith("dynamics.actions.")}
+    loaded = with_weights(Simulator, simulator.config, EffectsSpec(), plain).eval()
+    assert_same_steps(rollout(loaded, state), rollout(simulator, state))
     with pytest.raises(UnsupportedEffect, match="they require dynamics.actions.displacement"):
-        simulator.plan(SPEC)
+        loaded.plan(SPEC)
+    with pytest.raises(InputError, match=r"weights do not fit the model: Missing key.*dynamics.actions"):
+        with_weights(Simulator, simulator.config, SPEC, plain)
+    with pytest.raises(InputError, match=r"weights do not fit the model: Unexpected key.*dynamics.actions"):
+        with_weights(Simulator, CONFIG, EffectsSpec(), weights)
 
 
 def test_saved_states_keep_their_actions(tmp_path):

@@ -71,6 +71,12 @@ def _write_scene(layout: str, folder: Path) -> None:
     WRITERS[layout](folder, make_scene(**SMALL))
 
 
+def _write_actions(folder: Path) -> None:
+    _write_scene("genesis", folder)
+    positions = np.random.default_rng(0).uniform(-1, 1, (SMALL["n_steps"], 2, 3)).astype(np.float32)
+    np.savez(folder / "actions.npz", positions=positions, types=np.array(["pusher", "gripper"]))
+
+
 def _write_video_scene(folder: Path) -> None:
     WRITERS["videos"](folder, make_scene(**SMALL))
     shutil.rmtree(folder / "labels")  # they are of other frames than a video's, which count from 0
@@ -133,6 +139,10 @@ def _read_scene(folder: Path, what: str) -> None:
             raise Failure("check-data sees nothing wrong with a scene that cannot be read") from None
         raise
     finite([cameras, torch.from_numpy(scene.origin)], "cameras")
+    if (actions := scene.recording.actions) is not None:
+        finite([torch.from_numpy(actions.positions)], "actions")
+        if actions.positions.shape != (scene.n_steps, len(actions.types), 3):
+            raise Failure("positions of actions do not fit their types and the scene's steps")
     if not (cameras.near > 0).all() or not (cameras.far > cameras.near).all():
         raise Failure("near and far are no range")
     if labels is not None and labels.shape != (*images.shape[:2], *images.shape[3:]):
@@ -398,6 +408,7 @@ READERS = {
         lambda folder, what: _read_scene(folder / "data" / "subject_1" / "20231025_165502", what),
         ("meta.yaml", "extrinsics_20231014.yaml"),
     ),
+    "scene_actions": Reader(_write_actions, _read_scene, ("actions.npz",)),
     "scene_video": Reader(_write_video_scene, _read_scene, (*_JSON, "cam_0.mp4")),
     "scene_colmap": Reader(
         partial(_write_colmap, binary=True), _read_scene, ("cameras.bin", "images.bin", "points3D.bin")
