@@ -121,9 +121,9 @@ def read_onnx(content: bytes) -> dict[str, np.ndarray]:
             found = dict(fields)  # 1: sizes, 2: data type, 8: name, 9: values
             if found[2] == _FLOAT32:
                 shape = [value for number, value in fields if number == 1]
-                arrays[bytes(found[8]).decode()] = np.frombuffer(bytearray(found[9]), "<f4").reshape(shape)
+                arrays[str(found[8], "utf-8")] = np.frombuffer(found[9], "<f4").reshape(shape).copy()
         return arrays
-    except (IndexError, KeyError, TypeError, ValueError) as error:
+    except (IndexError, KeyError, OverflowError, TypeError, ValueError) as error:
         raise InputError(f"not a readable ONNX file: {error}") from None
 
 
@@ -133,12 +133,13 @@ def _fields(data: memoryview) -> Iterator[tuple[int, int | memoryview]]:
 
     def varint() -> int:
         nonlocal at
-        value = shift = 0
-        while True:
-            byte = data[at]
-            value, shift, at = value | (byte & 127) << shift, shift + 7, at + 1
+        value = 0
+        for shift in range(0, 70, 7):
+            byte, at = data[at], at + 1
+            value |= (byte & 127) << shift
             if byte < 128:
                 return value
+        raise ValueError("a number of more than 64 bits")
 
     while at < len(data):
         number, kind = divmod(varint(), 8)

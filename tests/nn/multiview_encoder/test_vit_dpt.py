@@ -162,14 +162,13 @@ def test_a_larger_rig_gives_larger_depth(unit, monkeypatch):
 
 
 def test_depth_comes_back_into_range():
-    """An output beyond far has a gradient that brings it back."""
+    """An output beyond far has a gradient that brings it back, and none that takes it away."""
     encoder, frames = make_encoder(), make_frames([0])
     encoder.depth.log_scale.data.fill_(5.0)
     particles = encoder(frames)
-    (gradient,) = torch.autograd.grad(
-        (particles.means - frames.origin[0].float()).square().sum(), encoder.depth.log_scale
-    )
-    assert gradient > 0 and particles.means.isfinite().all()
+    distance = (particles.means - frames.origin[0].float()).square().sum()
+    back, away = (torch.autograd.grad(s * distance, encoder.depth.log_scale, retain_graph=True)[0] for s in (1, -1))
+    assert back > 0 and away == 0 and particles.means.isfinite().all()
 
 
 @pytest.mark.parametrize("frozen", ["none", "backbone", "depth"])

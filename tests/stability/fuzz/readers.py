@@ -28,6 +28,7 @@ import numpy as np
 import torch
 import trimesh
 import yaml
+from safetensors.torch import save_file
 
 from gsim3d.compat.released_import import import_released
 from gsim3d.data import Scene
@@ -36,12 +37,16 @@ from gsim3d.effects.edits import load_edits
 from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError, NumericalError
 from gsim3d.evaluate.perceptual import weights
+from gsim3d.evaluate.perceptual.convert import read_onnx
 from gsim3d.evaluate.plan_report import TIMES, load_times
 from gsim3d.evaluate.predictions import Predictions
 from gsim3d.io import checkpoint, read_particles, read_ply, read_splats, write_particles, write_ply, write_splats
 from gsim3d.io.files import read_yaml
 from gsim3d.io.sequence import open_sequence, write_about
 from gsim3d.io.settings import from_dict, to_dict
+from gsim3d.nn.multiview_encoder import Encoder
+from gsim3d.nn.multiview_encoder.config import ViTConfig
+from gsim3d.nn.multiview_encoder.depth_weights import load_depth_weights
 from gsim3d.numerics.speed import load_speed
 from gsim3d.simulator import Simulator
 from gsim3d.state import Gaussians, Particles
@@ -56,6 +61,7 @@ from tests.data.made_scenes import WRITERS, edit_json, make_scene
 from tests.data.made_videos import trimmed, with_gaps, write_plain, write_scene as write_videos
 from tests.data.test_colmap import seen_points, write_colmap
 from tests.data.test_transforms import write_synthetic
+from tests.evaluate.perceptual.test_dinov2_weights import onnx_of
 from tests.io.spz_files import spz_4
 from tests.io.test_ply import DC, REST, SHAPE, XYZ, rows_of
 from tests.stability.fuzz.engine import LARGE, Failure, Target, finite
@@ -327,6 +333,21 @@ def _read_weights(folder: Path, what: str) -> None:
         del weights.SOURCES["fuzzed"]
 
 
+@functools.cache
+def _depth_encoder() -> Encoder:
+    return Encoder(dataclasses.replace(CONFIG.encoder, backbone="vit_dpt", vit=ViTConfig("tiny")))
+
+
+def _write_depth_weights(folder: Path) -> None:
+    state = {name: value.contiguous() for name, value in _depth_encoder().depth.backbone.state_dict().items()}
+    save_file(state, folder / "a.safetensors")
+
+
+def _read_depth_weights(folder: Path, what: str) -> None:
+    load_depth_weights(_depth_encoder(), folder / "a.safetensors")
+    finite(dict(_depth_encoder().state_dict()))
+
+
 CUBE = trimesh.creation.box((1, 2, 3))
 MESHES = ("m.obj", "m.ply", "m.stl", "m.glb", "m.off")
 
@@ -457,6 +478,11 @@ READERS = {
         _read_effects,
     ),
     "edits": Reader(_write_edits, lambda folder, what: load_edits(folder / "edits.yaml", lambda scene: None)),
+    "depth_weights": Reader(_write_depth_weights, _read_depth_weights),
+    "onnx": Reader(
+        lambda folder: (folder / "a.onnx").write_bytes(onnx_of(dict.fromkeys("ab", np.ones((2, 3), np.float32)))),
+        lambda folder, what: read_onnx((folder / "a.onnx").read_bytes()),
+    ),
     "weights": Reader(_write_weights, _read_weights),
     "predictions": Reader(partial(_write_predictions, video=False), _read_predictions, (), "predicted"),
     "predictions_video": Reader(partial(_write_predictions, video=True), _read_predictions, (), "predicted"),
