@@ -54,7 +54,7 @@ class ActionParticles(nn.Module):
             acting: types of the points to add.
 
         Raises:
-            InputError: the actions are of fewer scenes, or of a type that the model does not know.
+            InputError: the model does not know the type of a point.
         """
         points = self._points(history, acting)
         given, points = with_same_attributes([history, points])
@@ -80,8 +80,6 @@ class ActionParticles(nn.Module):
     def _points(self, history: Particles, acting: tuple[str, ...]) -> Particles:
         """The action particles of all clouds; those that a scene does not have are asleep."""
         actions, table, like = history.actions, history.clouds, history.means
-        if len(actions.types) != len(history.origin):
-            raise InputError(f"actions: must be of {len(history.origin)} scenes; got {len(actions.types)}")
         types = self._types(actions, acting)[constant(table.scenes, like.device)]
         now = actions.at(table).to(like)
         moved = ((actions.at(table, 1).to(like) - now) / self.cell)[..., None]

@@ -193,6 +193,8 @@ def check_particles(particles: Particles, where: str, dtype: torch.dtype, widths
             raise InputError(f"{where}: particles.{name} must be {wanted} [{sizes}]; got {got}")
         if value.device != device:
             raise InputError(f"{where}: particles.{name} is on {value.device}, particles.means on {device}")
+    if particles.actions is not None:
+        _check_actions(particles, where)
     clouds, n_scenes = particles.clouds, len(particles.origin)
     starts = clouds.starts
     if starts[0] != 0 or starts[-1] != particles.n_rows or any(b < a for a, b in pairwise(starts)):
@@ -201,6 +203,18 @@ def check_particles(particles: Particles, where: str, dtype: torch.dtype, widths
         raise InputError(f"{where}: particles.cloud_scene must be in [0, {n_scenes}), rows of origin, as cloud_step")
     if device.type == "cpu":
         _check_choices(particles, where)
+
+
+def _check_actions(particles: Particles, where: str) -> None:
+    positions, types = particles.actions.positions, particles.actions.types
+    n_scenes, device = len(particles.origin), particles.means.device
+    fits = positions.shape == (n_scenes, *positions.shape[1:2], *types.shape[1:], 3) and len(types) == n_scenes
+    if not fits or {positions.device, types.device} != {device}:
+        got = f"{list(positions.shape)} and {list(types.shape)} on {positions.device}"
+        raise InputError(
+            f"{where}: particles.actions must have positions [{n_scenes}, T, A, 3] and types [{n_scenes}, A] on {device}; "
+            f"got {got}"
+        )
 
 
 def _check_choices(particles: Particles, where: str) -> None:
