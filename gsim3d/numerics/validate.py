@@ -212,8 +212,8 @@ def _check_actions(particles: Particles, where: str) -> None:
     if not fits or {positions.device, types.device} != {device}:
         got = f"{list(positions.shape)} and {list(types.shape)} on {positions.device}"
         raise InputError(
-            f"{where}: particles.actions must have positions [{n_scenes}, T, A, 3] and types [{n_scenes}, A] on {device}; "
-            f"got {got}"
+            f"{where}: particles.actions must have positions [{n_scenes}, T, A, 3] and types [{n_scenes}, A] "
+            f"on {device}; got {got}"
         )
 
 
