@@ -178,6 +178,10 @@ class Scene:
         """Returns whether the scene has labels, recorded or by background subtraction."""
         return self.recording.read_labels is not None or self.recording.subtract_background
 
+    def has_actions(self) -> bool:
+        """Returns whether the scene has actors."""
+        return self.recording.actions is not None
+
     def valid(self, cams, steps) -> Tensor | None:
         """Returns bool [len(steps), len(cams), H, W]: pixels that are neither padding nor outside the distorted image.
 

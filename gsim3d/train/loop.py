@@ -101,6 +101,8 @@ class Trainer:
         if not self.effects.outputs.rgb:
             raise InputError("effects: outputs.rgb is off, but the loss compares colours; leave it on")
         check_settings(config, self.simulator.config.dynamics, self.plan, self.processes.count)
+        if self.effects.dynamics.actions and not any(scene.has_actions() for scene in scenes):
+            raise InputError("effects: dynamics.actions is on, but no scene has actions (actions.npz); leave it out")
         perceptual = load("lpips_vgg", partial(LPIPS, "vgg")).to(device) if config.loss.perceptual else None
         self.loss_of_images = partial(training_loss, config.loss, perceptual)
         self.parameters = dict(self.simulator.named_parameters())

@@ -117,6 +117,8 @@ class Restored:
                 f"depth range {own[0]:.3g} to {own[1]:.3g} replaced by that of the training, {scene.near:.3g} to "
                 f"{scene.far:.3g} (--keep depth preserves it)"
             )
+        if self.plan.spec.dynamics.actions and not scene.has_actions():
+            changes.append("no actors, because the scene has no actions.npz")
         if scene.recording.subtract_background:
             changes.append(
                 'background subtracted and set to black (preserve it with "masks": "none" in cameras.json, or provide '

@@ -2,12 +2,14 @@
 
 import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pytest
 import torch
 
 from gsim3d.data import Scene
+from gsim3d.errors import FitWarning
 from gsim3d.synth import generate
 from gsim3d.train.config import DataConfig, PhaseConfig, TrainConfig
 from gsim3d.train.loop import Trainer
@@ -45,6 +47,10 @@ def test_errors_of_a_simulator_that_moves_nothing_are_those_of_constant(tmp_path
         assert errors["constant"] == pytest.approx(np.linalg.norm(center[13] - center[1]), abs=1e-6)
         assert errors["model"] == pytest.approx(errors["constant"], abs=1e-4)
     restored = restore(tmp_path / "run")
+    (tmp_path / "silent").mkdir()
+    shutil.copytree(folders[0], tmp_path / "silent" / "box", ignore=shutil.ignore_patterns("actions.npz"))
+    with pytest.warns(FitWarning, match="no actors, because the scene has no actions.npz"):
+        restored.open_scene(tmp_path / "silent" / "box")
     scene, moved = restored.open_scene(folders[0]), torch.tensor([0.3, 0.0, 0.0])
     roll = restored.simulator.rollout
 

@@ -397,6 +397,12 @@ def test_captured_training_equals_eager(scenes, tmp_path, device):
     assert captured == pytest.approx(plain, rel=1e-3)
 
 
+def test_actions_need_scenes_with_actors(tmp_path):
+    plain = [Scene.open(folder) for folder in find_scenes(write_scenes(tmp_path / "plain", 1))]
+    with pytest.raises(InputError, match="dynamics.actions is on, but no scene has actions"):
+        Trainer(ACTING, plain, tmp_path / "run")
+
+
 def test_capture_refuses_models_that_draw(scenes, trainer):
     config = trainer.simulator.config
     for changes in ({"drop_path": 0.1}, {"shuffle_orders": True}):

@@ -43,6 +43,7 @@ class Trajectory:
         width: pixels.
         height: pixels.
         fps: frames per second.
+        acting: whether it has actors.
     """
 
     slot: int
@@ -52,6 +53,7 @@ class Trajectory:
     width: int
     height: int
     fps: float
+    acting: bool = False
 
     @property
     def name(self) -> str:
@@ -59,6 +61,9 @@ class Trajectory:
 
     def has_segmentation(self) -> bool:
         return True
+
+    def has_actions(self) -> bool:
+        return self.acting
 
 
 class TrajectoryStore:
@@ -86,7 +91,9 @@ class TrajectoryStore:
         self._near, self._far = rig.near, rig.far
         self.lock = threading.RLock()  # held while trajectories come or are read
         self.trajectories = [
-            Trajectory(slot, Path(f"trajectory_{slot}"), *self._shape[:2], rig.size, rig.size, world.fps)
+            Trajectory(
+                slot, Path(f"trajectory_{slot}"), *self._shape[:2], rig.size, rig.size, world.fps, bool(self._names)
+            )
             for slot in range(capacity)
         ]
 
