@@ -82,6 +82,7 @@ class _Push(TaskEnv):
 
     actors = ("pusher", (2,))
     max_action = (MAX_SPEED, MAX_SPEED)
+    shipped = "push-small"
 
     @property
     def simulation(self) -> pushing.PushSimulation:

@@ -15,6 +15,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
+from gsim3d import pretrained
 from gsim3d.envs.model import ModelScenes
 from gsim3d.envs.scenes import FPS, N_PARTICLES, N_VIEWS, Scenes, TrueScene, TrueScenes, task_rig
 from gsim3d.errors import InputError
@@ -42,7 +43,7 @@ class TaskEnv(gymnasium.Env):
         image_size: pixels, width and height of observed images.
         render_mode: None or "rgb_array": the first camera.
         backend: "truth": MuJoCo; "model": a learned simulator, which encodes images of the truth's start.
-        model: name or path of the simulator, for ``backend="model"``.
+        model: name or path of the simulator, for ``backend="model"``. Default: the task's shipped one, if there is one.
         device: "cpu" or "cuda", of the simulator.
 
     Attributes:
@@ -57,6 +58,7 @@ class TaskEnv(gymnasium.Env):
     max_bodies: ClassVar[int] = 1
     actors: ClassVar[tuple[str, tuple[int, ...]] | None] = None  # name and shape of their observed positions
     max_action: ClassVar[tuple[float, ...]]
+    shipped: ClassVar[str] = ""  # name of the simulator that is the default of ``model``, once it ships
 
     def __init__(self, observation: str = "particles", image_size: int = 64, render_mode: str | None = None, **options):
         self._episodes = Episodes(type(self), 1, observation, image_size, render_mode, **options)
@@ -158,9 +160,9 @@ class Episodes:
         self.task, self.count, self.observation, self.rig = task, count, observation, task_rig(image_size)
         self.scenes: Scenes
         if backend == "model":
-            if model is None:
+            if model is None and task.shipped not in pretrained.names():
                 raise InputError('backend="model" needs model=PATH, a checkpoint of a trained simulator')
-            simulator = Simulator.from_pretrained(model, device=device)
+            simulator = Simulator.from_pretrained(model or task.shipped, device=device)
             self.scenes = ModelScenes(simulator, count, task.max_bodies, image_size)
         elif model is not None or device != "cpu":
             raise InputError('model and device are of backend="model"; MuJoCo simulates the truth on the CPU')
@@ -237,8 +239,8 @@ class Episodes:
 class TaskVectorEnv(VectorEnv):
     """Episodes of a task side by side; a learned simulator predicts them in one batch.
 
-    Observations, rewards and flags are tensors on the device of the simulator, without copies
-    (``metadata["torch"]``); environment i equals a single one of seed ``seed + i``.
+    Of a learned simulator, observations, rewards, flags and infos are tensors on its device, without copies
+    (``metadata["torch"]``); of the truth, arrays. Environment i equals a single one of seed ``seed + i``.
 
     Args:
         num_envs: number of environments, n.
@@ -263,7 +265,8 @@ class TaskVectorEnv(VectorEnv):
             raise InputError(f"num_envs must be at least 1; got {num_envs}")
         self._episodes = Episodes(self.task, num_envs, **options)
         self.mode, self.num_envs = AutoresetMode(autoreset_mode), num_envs
-        self.metadata = {**self.task.metadata, "torch": True, "autoreset_mode": self.mode}
+        self._torch = not isinstance(self._episodes.scenes, TrueScenes)
+        self.metadata = {**self.task.metadata, "torch": self._torch, "autoreset_mode": self.mode}
         self.render_mode, self._most_steps = options.get("render_mode"), max_episode_steps
         self.single_observation_space = self._episodes.observation_space
         self.single_action_space = self._episodes.action_space
@@ -287,17 +290,18 @@ class TaskVectorEnv(VectorEnv):
         Raises:
             InputError: seeds or mask have a wrong length, or the first reset is not of all environments.
         """
-        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed or [None] * self.num_envs
+        if seed is None or isinstance(seed, (int, np.integer)):
+            seed = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
         chosen = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, bool)))
-        if len(seeds) != self.num_envs or chosen.shape != (self.num_envs,) or chosen.dtype != bool:
+        if len(seed) != self.num_envs or chosen.shape != (self.num_envs,) or chosen.dtype != bool:
             raise InputError(f"seed and reset_mask must be of {self.num_envs} environments")
         if self._episodes.executed is None and not chosen.all():
             raise InputError("reset_mask: the first reset must be of all environments")
         for number in chosen.nonzero()[0].tolist():
-            if seeds[number] is not None:
-                self._rngs[number] = seeding.np_random(seeds[number])[0]
+            if seed[number] is not None:
+                self._rngs[number] = seeding.np_random(seed[number])[0]
         self._begin(chosen)
-        return self._episodes.observe(), self._infos(self._episodes.info(), chosen)
+        return self._given(self._episodes.observe()), self._given(self._infos(self._episodes.info(), chosen))
 
     def step(self, actions: Tensor | np.ndarray):
         """One step of all environments: observations, rewards [n], terminations [n], truncations [n], infos.
@@ -329,7 +333,7 @@ class TaskVectorEnv(VectorEnv):
             self._begin(self._over)
             infos |= self._infos(episodes.info(), np.ones(self.num_envs, bool))
             observed = episodes.observe()
-        return observed, rewards, terminated, truncated, infos
+        return tuple(self._given(value) for value in (observed, rewards, terminated, truncated, infos))
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """uint8 [H, W, 3] of the first camera of each environment; None without a render mode."""
@@ -356,6 +360,16 @@ class TaskVectorEnv(VectorEnv):
         kept = {name: value for name, value in infos.items() if not name.startswith("_")}
         found = {"final_obs": final, "final_info": self._infos(kept, self._over)}
         return {**infos, **self._infos(found, self._over)}
+
+    def _given(self, value: Any) -> Any:
+        """``value``, nested in dictionaries and arrays of objects, with arrays instead of tensors for the truth."""
+        if self._torch:
+            return value
+        if isinstance(value, dict):
+            return {name: self._given(one) for name, one in value.items()}
+        if isinstance(value, np.ndarray) and value.dtype == object:
+            value[:] = [self._given(one) for one in value]
+        return value.numpy() if isinstance(value, Tensor) else value
 
     def _infos(self, found: dict[str, Any], chosen: np.ndarray) -> dict[str, Any]:
         return {**found, **{f"_{name}": chosen.copy() for name in found}}
