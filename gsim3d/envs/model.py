@@ -179,11 +179,18 @@ class ModelScenes(Scenes):
         return dataclasses.replace(self.simulator.rollout(acting, 1, self.plan, wrap=self._wrap)[0], actions=None)
 
     @torch.no_grad()
-    def repeated(self, state: ModelState, count: int) -> ModelScenes:
+    def repeated(self, state: ModelState, count: int, reach: float | None = None) -> ModelScenes:
         """``count`` copies of one scene in ``state``, for predictions with different actions.
 
-        A static background that the model computes once a rollout is shared by all copies; else all particles in the
-        network's input are copied.
+        A background that the model computes once a rollout (``background="asymmetric"``) is shared by all copies, and
+        only moving particles are copied. Other models have the background in the input of every step, so that it is
+        copied, too; ``reach`` limits it.
+
+        Args:
+            state: of one scene.
+            count: number of copies.
+            reach: metres; copies lack the background that is farther, along the ground, from all moving particles.
+                Default: they have all of it.
 
         Raises:
             InputError: these are several scenes.
@@ -191,14 +198,17 @@ class ModelScenes(Scenes):
         if self.count != 1:
             raise InputError(f"one scene can be repeated; got {self.count}")
         copies, particles = copy.copy(self), state.particles
+        newest, frozen = last_steps(particles, 1), particles.activity == FROZEN
+        kept = torch.ones_like(frozen)
         if self.simulator.config.dynamics.is_asymmetric:
-            newest = last_steps(particles, 1)
             static = self.simulator.dynamics.remember(newest.select_rows(newest.activity == FROZEN))
-            shared = SharedContext(**vars(static))
+            shared, kept = SharedContext(**vars(static)), ~frozen
             copies._wrap = lambda predict: lambda history, background, **options: predict(history, shared, **options)
-            moving = particles.activity != FROZEN
-            copies._rows = (newest.activity != FROZEN).cumsum(0)[self._rows] - 1
-            particles = particles.select_rows(moving)
+        elif reach is not None:
+            moving = newest.means[newest.activity != FROZEN, :2]
+            kept[frozen] = torch.cdist(particles.means[frozen, :2], moving).amin(1) <= reach
+        copies._rows = kept[newest_mask(particles)].cumsum(0)[self._rows] - 1
+        particles = particles.select_rows(kept)
         copies.count, copies.state = count, ModelState(_tiled(particles, count), state.actors.expand(count, -1, -1, -1))
         for name in ("_rows", "_members", "_rest", "_centers"):
             value = getattr(copies, name)
@@ -226,14 +236,10 @@ class ModelScenes(Scenes):
         return self.state.actors[:, -1]
 
     def centers(self) -> Tensor:
-        return self.centers_of(self.points())
-
-    def centers_of(self, points: Tensor) -> Tensor:
-        """Centers of the bodies [..., n, B, 3] for positions [..., n, 256, 3] of their points."""
-        weights = self._members / self._members.sum(-1, keepdim=True).clamp_min(1)
-        before, after = weights @ self._rest, weights @ points.double()
-        arms = self._rest[:, None] - before[:, :, None], points.double()[..., None, :, :] - after[..., None, :]
-        u, _, vh = torch.linalg.svd(torch.einsum("nbp,...nbpi,nbpj->...nbij", weights, arms[1], arms[0]))
+        points, weights = self.points().double(), self._members / self._members.sum(-1, keepdim=True).clamp_min(1)
+        before, after = weights @ self._rest, weights @ points
+        arms = points[:, None] - after[:, :, None], self._rest[:, None] - before[:, :, None]
+        u, _, vh = torch.linalg.svd(torch.einsum("nbp,nbpi,nbpj->nbij", weights, *arms))
         u = torch.cat([u[..., :2], u[..., 2:] * torch.linalg.det(u @ vh)[..., None, None]], -1)  # no mirroring
         return after + ((u @ vh) @ (self._centers - before)[..., None])[..., 0]
 

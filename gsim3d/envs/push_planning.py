@@ -63,14 +63,15 @@ class ModelDynamics:
 
     Args:
         scenes: one scene; calls leave it as it is.
+        reach: see :meth:`gsim3d.envs.model.ModelScenes.repeated`.
     """
 
-    def __init__(self, scenes: ModelScenes):
-        self.scenes = scenes
+    def __init__(self, scenes: ModelScenes, reach: float | None = None):
+        self.scenes, self.reach = scenes, reach
 
     def __call__(self, state: ModelState, actions: Tensor) -> PushStates:
         """Positions after each of ``actions`` [K, H, 2], m/s, from ``state``."""
-        copies = self.scenes.repeated(state, len(actions))
+        copies = self.scenes.repeated(state, len(actions), self.reach)
         centers, pusher = [], []
         for action in actions.to(copies.device, torch.float64).unbind(1):
             PushToGoal.act(copies, action)

@@ -101,8 +101,9 @@ def test_centers_follow_the_rigid_motion_of_the_points(model):
     scenes = task.scenes
     turn = torch.tensor([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]]).double()
     shift = torch.tensor([0.1, -0.2, 0.3])
-    moved = scenes.centers_of(scenes.points().double() @ turn.T + shift)
-    expected = scenes.centers() @ turn.T + shift
+    points, expected = scenes.points().double(), scenes.centers() @ turn.T + shift
+    scenes.points = lambda: points @ turn.T + shift
+    moved = scenes.centers()
     exists = expected.isfinite()
     assert exists.any() and (moved - expected)[exists].abs().max() < 1e-5 and torch.equal(moved.isnan(), ~exists)
 
@@ -235,6 +236,21 @@ def test_copies_of_a_scene_predict_what_it_does(background):
     assert (states.centers[0, 1] - states.centers[1, 1]).abs().max() > 1e-7
 
 
+@pytest.mark.parametrize("background", ["symmetric", "relightable"])
+def test_copies_lack_the_background_out_of_reach(background):
+    scenes = scenes_of(background=background, norm="layer")
+    frozen = scenes.state.particles.activity == FROZEN
+    given = actions(2).unflatten(0, (2, 1))
+    counts, centers = [], []
+    for reach in (None, 100.0, 0.05):
+        copies = scenes.repeated(scenes.state, 2, reach)
+        counts.append(copies.state.particles.n_rows)
+        assert torch.equal(copies.points()[1], scenes.points()[0])
+        centers.append(ModelDynamics(scenes, reach)(scenes.state, given).centers)
+    assert counts[0] == counts[1] > counts[2] > 2 * (~frozen).sum()
+    assert torch.equal(centers[0], centers[1]) and not torch.equal(centers[0], centers[2])
+
+
 def test_relightable_scenes_drop_only_what_the_network_does_not_see():
     scenes, moved = scenes_of(background="relightable", norm="layer"), []
     for reduced in (ModelScenes._reduced.__get__(scenes), lambda particles: particles):
@@ -285,10 +301,10 @@ def test_benchmark_plans_in_a_model_from_images_of_the_truth(monkeypatch, capsys
     monkeypatch.setitem(bench.SETTINGS, "samples", 3)
     monkeypatch.setitem(bench.SETTINGS, "iterations", 1)
     scenes, env = scenes_of(), gymnasium.make("gsim3d/PushToGoal-v0", max_episode_steps=6)
-    episode = bench.run("model", env, 1000, scenes, 2)
+    episode = bench.run("model", env, 1000, scenes=scenes, reach=0.5, chunk=2)
     assert episode["steps"] == 6 and len(episode["plan_seconds"]) == len(episode["errors"]) == 2
     assert np.array(episode["errors"]).shape == (2, 2, 8) and np.isfinite(episode["errors"]).all()
-    found = bench.summary([episode, bench.run("zero", env, 1000, None, None)])
+    found = bench.summary([episode, bench.run("zero", env, 1000)])
     bench.show("model", found)
     assert found["solved"] == 0 and len(found["median_errors"]["model"]) == 8
     assert "solved 0 of 2 (95 %: 0% to 66%)" in capsys.readouterr().out

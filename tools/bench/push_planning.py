@@ -64,9 +64,9 @@ class InModel:
         errors: of each plan, of the body's center [H] in metres, and of a body that does not move.
     """
 
-    def __init__(self, scenes: ModelScenes, task: PushToGoal, seed: int, chunk: int | None):
+    def __init__(self, task: PushToGoal, seed: int, scenes: ModelScenes, reach: float | None, chunk: int | None):
         self.task, self.scenes, self.seed, self.errors = task, scenes, seed, []
-        self.dynamics, cost = ModelDynamics(scenes), GoalCost(torch.from_numpy(task.goal).to(scenes.device))
+        self.dynamics, cost = ModelDynamics(scenes, reach), GoalCost(torch.from_numpy(task.goal).to(scenes.device))
         self.planner = MPPI(self.dynamics, cost, *action_bounds(), seed=seed, chunk=chunk, **SETTINGS)
         first = (task.scenes.all[0].view(scenes.rig), task.scenes.all[0].actors)
         self.seen = deque([first] * scenes.history, maxlen=scenes.history)  # at rest before the start
@@ -91,12 +91,17 @@ class InModel:
         self.errors.append([(one - truth).norm(dim=1).tolist() for one in (predicted, at)])
 
 
-def run(agent: str, env: gymnasium.Env, seed: int, scenes: ModelScenes | None, chunk: int | None) -> dict:
-    """One episode: whether it was solved, the last distance, steps, seconds of each plan, and errors of the model."""
+def run(agent: str, env: gymnasium.Env, seed: int, **of_model) -> dict:
+    """One episode: whether it was solved, the last distance, steps, seconds of each plan, and errors of the model.
+
+    ``of_model``: ``scenes``, ``reach`` and ``chunk`` of :class:`InModel`.
+    """
     _, info = env.reset(seed=seed)
     task, rng, times, planner = env.unwrapped, np.random.default_rng(seed), [], None
-    if agent in PLANNERS:
-        planner = InModel(scenes, task, seed, chunk) if agent == "model" else InTruth(PLANNERS[agent], task, seed)
+    if agent == "model":
+        planner = InModel(task, seed, **of_model)
+    elif agent in PLANNERS:
+        planner = InTruth(PLANNERS[agent], task, seed)
     ended, steps, reward, actions = False, 0, 0.0, []
     while not ended:
         if agent == "zero":
@@ -171,6 +176,7 @@ def main() -> None:
     parser.add_argument("--agents", nargs="+", choices=("zero", "random", *PLANNERS), help="default: all that can run")
     parser.add_argument("--model", help="simulator of the agent model: a checkpoint, or a shipped name")
     parser.add_argument("--device", default="cpu", help="of the simulator (default %(default)s)")
+    parser.add_argument("--reach", type=float, help="metres around bodies and pusher of the background that is copied")
     parser.add_argument("--chunk", type=int, help="largest number of sequences that the simulator predicts together")
     parser.add_argument("--seeds", type=int, default=50, help="number of episodes (default %(default)s)")
     parser.add_argument("--out", type=Path, help="file for all numbers")
@@ -179,16 +185,17 @@ def main() -> None:
     if "model" in agents and args.model is None:
         parser.error("the agent model needs --model PATH")
     scenes = args.model and ModelScenes(Simulator.from_pretrained(args.model, device=args.device), 1, 1)
+    of_model = {"scenes": scenes, "reach": args.reach, "chunk": args.chunk}
     env, found = gymnasium.make("gsim3d/PushToGoal-v0"), {}
     for agent in agents:
         seeds = range(FIRST_SEED, FIRST_SEED + args.seeds)
-        found[agent] = summary([run(agent, env, seed, scenes, args.chunk) for seed in seeds])
+        found[agent] = summary([run(agent, env, seed, **of_model) for seed in seeds])
         show(agent, found[agent])
     if args.out:
         about = {"task": "PushToGoal", "first_seed": FIRST_SEED, "every": EVERY, **SETTINGS}
         if args.model:
             device = torch.cuda.get_device_name() if args.device == "cuda" else args.device
-            about |= {"model": args.model, "device": device}
+            about |= {"model": args.model, "device": device, "reach": args.reach}
         args.out.write_text(json.dumps({"about": about, "agents": found}, indent=1) + "\n")
 
 
