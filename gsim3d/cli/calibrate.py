@@ -11,9 +11,9 @@ EPILOG = """\
 DIR holds one film a camera, <camera>.mp4, or one folder of such films for each take. The cameras must not move.
 
 With --board, films of a ChArUco board lie in DIR/board (or the films show it themselves): move the board slowly,
-tilted, into all corners of every image, then lay it on the floor in view of most cameras. The world is the board at
-rest: z points out of its printed side, lengths are metres. Without --board, COLMAP matches features of the still
-background (pip install 'gsim3d[capture]'); lengths are metres with --scale only.
+tilted, into all corners of every image, then lay it on the floor in view of two cameras or more. The world is the
+board at the end: z points out of its printed side, lengths are metres. Without --board, COLMAP matches features of
+the still background (pip install 'gsim3d[capture]'); lengths are metres with --scale only.
 
 Films that start at different times are aligned by the motion that they show. Writes cameras.json beside the films
 (docs/reference/data.md, videos), with the reprojection error of each camera.

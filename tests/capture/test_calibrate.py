@@ -9,13 +9,16 @@ import pytest
 
 from gsim3d.capture.board import Board
 from gsim3d.capture.calibrate import calibrate
-from gsim3d.capture.films import time_offsets
+from gsim3d.capture.films import Film, time_offsets
 from gsim3d.cli.main import main
-from gsim3d.data import Scene
-from gsim3d.data.recording import Problems
+from gsim3d.data import Scene, find_scenes
+from gsim3d.data.lenses import Undistorter
+from gsim3d.data.recording import Lens, Problems
 from gsim3d.data.video_file import Video
 from gsim3d.errors import InputError
 from tests.capture.made_films import FPS, SIZE, rig, write_board_films, write_textured_films
+from tests.tiny_scenes import write_scenes
+from tools.films import Damage, degraded, write_films
 
 BOARD = Board(7, 5, 0.06)
 STARTS = (0.0, 3 / FPS, -2 / FPS)  # seconds
@@ -48,7 +51,7 @@ def test_board_gives_intrinsics_and_metric_poses(films):
         assert entry["name"] == name and entry["calibration"]["error"] < 0.3
         assert np.abs(np.array(entry["K"]) - K).max() < 3
     for found, true in zip(relative(poses), relative([camera[2] for camera in rig()]), strict=True):
-        assert angle(found, true) < 0.3
+        assert angle(found, true) < 0.5
         assert np.linalg.norm(found[:3, 3] - true[:3, 3]) < 0.004
 
 
@@ -134,3 +137,24 @@ def test_missing_pycolmap_names_the_extra(films, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pycolmap", None)
     with pytest.raises(InputError, match=r"pip install 'gsim3d\[capture\]'"):
         calibrate(films, say=lambda _: None)
+
+
+def test_films_of_generated_scenes_have_the_true_cameras(tmp_path):
+    """What tools/films.py degrades is what its truth.json says: undistorted, a film shows the generated scene again."""
+    data = write_scenes(tmp_path / "data", 1, n_steps=8, size=64)
+    truth = write_films(data, tmp_path / "films", [0, 1], Damage(noise=0.0, exposure=0.0, dropped=0.0, late=3))
+    (take,) = (folder for folder in (tmp_path / "films").iterdir() if folder.name.startswith("ball"))
+    scene, films = Scene.open(find_scenes(data)[0]), [Film.open(take / f"cam_{cam}.mp4") for cam in (0, 1)]
+    for cam, (film, start) in enumerate(zip(films, truth["starts"][take.name], strict=True)):
+        late = round(start * scene.fps)
+        assert len(film.video.numbers) == 8 - late
+        true = truth[f"cam_{cam}"]
+        image = next(film.video.read([2], Problems()))
+        K = np.array(true["K"]) + [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+        shown = Undistorter(Lens(np.array(true["lens"])), (64, 64))(image, K)
+        expected = scene.images([cam], [2 + late])[0, 0].permute(1, 2, 0).numpy()
+        assert np.abs(shown.astype(int) - expected)[8:-8, 8:-8].mean() < 6
+    frames = [np.full((4, 4, 3), 10.0 * k) for k in range(30)]
+    damaged = list(degraded(frames, Damage(dropped=0.5), 1.1, np.random.default_rng(0)))
+    repeated = [(a == b).all() for a, b in zip(damaged, damaged[1:])]
+    assert 8 < sum(repeated) < 22 and not (damaged[0] == damaged[-1]).all()
