@@ -3,7 +3,7 @@
 Films have a lens, noise, an exposure of their own, dropped frames (the one before is shown again) and start at
 different times. OUT/truth.json has the true cameras and start times.
 
-python tools/films.py DATA OUT --cameras 0 1 2
+python -m tools.films DATA OUT --cameras 0 1 2
 """
 
 from __future__ import annotations
@@ -54,29 +54,31 @@ def rays(K: np.ndarray, lens: Iterable[float], size: tuple[int, int], samples: i
     return np.concatenate([flat, np.ones((*x.shape, 1))], -1)
 
 
-def board_pose(board: Board, time: float, at_rest: float) -> np.ndarray:
-    """Returns board -> world [4, 4]: its middle swings above the origin, and lies there from ``at_rest`` on."""
+def board_pose(board: Board, time: float, at_rest: float, viewer: np.ndarray) -> np.ndarray:
+    """Returns board -> world [4, 4]: it swings above the origin, turned to ``viewer``, and rests from ``at_rest`` on."""
     moving = float(np.clip((at_rest - time) / 0.3, 0, 1))
     width = board.columns * board.square
     # The pace changes, so that the motion of two films matches at one lag only.
     phase = 11 * time + 0.9 * np.sin(7 * time) + 0.4 * np.sin(13 * time)
-    turn = moving * np.array([0.3 + 0.5 * np.sin(phase), 0.6 * np.cos(0.7 * phase), 0.6 * np.sin(0.4 * phase)])
+    turn = moving * np.array([0.5 * np.sin(phase), 0.6 * np.cos(0.7 * phase), 0.6 * np.sin(0.4 * phase)])
+    across = np.hypot(*viewer[:2])
+    lean = 0.6 * moving * np.arctan2(across, viewer[2]) / across * np.array([-viewer[1], viewer[0], 0])
     pose, middle = np.eye(4), np.eye(4)
-    pose[:3, :3] = cv2.Rodrigues(turn)[0] @ np.diag([1.0, -1, -1])  # printed side up
+    pose[:3, :3] = cv2.Rodrigues(lean)[0] @ cv2.Rodrigues(turn)[0] @ np.diag([1.0, -1, -1])  # printed side up
     pose[:3, 3] = moving * 0.29 * width * np.array([np.sin(0.63 * phase), np.sin(0.5 * phase), 1])
     middle[:2, 3] = -0.5 * board.square * np.array([board.columns, board.rows])
     return pose @ middle
 
 
-def board_film(board: Board, K: np.ndarray, viewmat: np.ndarray, lens, size, times, at_rest: float, seed: int):
-    """Yields frames [h, w, 3] of the board at ``times``; pixel centres of ``K`` are integers."""
+def board_film(board: Board, K, viewmat: np.ndarray, lens, size, times, at_rest: float, viewer, seed: int):
+    """Yields frames [h, w, 3] of the board at ``times``, turned to ``viewer``; pixel centres of ``K`` are integers."""
     print_size = board.columns * PIXELS, board.rows * PIXELS
     paper = np.pad(board.made().generateImage(print_size), round(MARGIN * PIXELS), constant_values=255)
     local = rays(K, lens, size, SHARP)
     noise = np.random.default_rng(seed).uniform(60, 110, local.shape[:2]).astype(np.float32)
     scenery = cv2.GaussianBlur(noise, (0, 0), 3)
     for time in times:
-        to_board = np.linalg.inv(viewmat @ board_pose(board, time, at_rest))
+        to_board = np.linalg.inv(viewmat @ board_pose(board, time, at_rest, viewer))
         direction, origin = local @ to_board[:3, :3].T, to_board[:3, 3]
         hit = origin[:2] - direction[..., :2] * (origin[2] / direction[..., 2])[..., None]
         at = ((hit / board.square + MARGIN) * PIXELS - 0.5).astype(np.float32)
@@ -102,6 +104,7 @@ def write_films(data: Path, out: Path, cams: list[int], damage: Damage = Damage(
     first = scenes[0]
     size, (viewmats, Ks) = (first.width, first.height), first.recording.cameras_at_step(0)
     Ks = Ks - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    viewer = np.linalg.inv(viewmats[cams])[:, :3, 3].mean(0)
     exposures = {cam: 1 + damage.exposure * rng.uniform(-1, 1, 3) for cam in cams}
     truth = {"starts": {}}
     for cam in cams:
@@ -114,7 +117,9 @@ def write_films(data: Path, out: Path, cams: list[int], damage: Damage = Damage(
         for cam, start in zip(cams, starts, strict=True):
             if take == "board":
                 times = (start + np.arange(round(SECONDS * first.fps))) / first.fps
-                frames = board_film(BOARD, Ks[cam], viewmats[cam], damage.lens, size, times, SECONDS - AT_REST, cam)
+                frames = board_film(
+                    BOARD, Ks[cam], viewmats[cam], damage.lens, size, times, SECONDS - AT_REST, viewer, cam
+                )
             else:
                 at = (rays(Ks[cam], damage.lens, size) @ Ks[cam].T)[..., :2].astype(np.float32)
                 images = films[take].images([cam], range(start, films[take].n_steps))[:, 0].permute(0, 2, 3, 1).numpy()

@@ -92,8 +92,7 @@ class _Views:
 def calibrate_board(films: Sequence[Film], offsets: Sequence[float], board: Board) -> list[Calibrated]:
     """Calibrates cameras by a board that is moved before them, or several of them see at rest.
 
-    The world is the board where two cameras see it at once for the last time: x along its rows, z out of the printed
-    side.
+    The world is the board where a camera sees it last: x along its rows, z out of the printed side.
 
     Args:
         films: films of the board.
@@ -111,7 +110,7 @@ def calibrate_board(films: Sequence[Film], offsets: Sequence[float], board: Boar
         cam = max((c for c, v in enumerate(views) if frame in v.found), key=lambda c: len(views[c].found[frame][0]))
         boards[frame] = np.linalg.inv(cameras[cam]) @ views[cam].found[frame][2]
     cameras, boards, residuals = _adjust(views, cameras, boards)
-    world = boards[max(frame for frame in frames if sum(frame in v.found for v in views) > 1)]
+    world = boards[frames[-1]]
     turn = np.eye(4)
     turn[:3, :3] = OUT_OF_PAPER
     errors = [float(np.sqrt(np.square(np.concatenate(own)).sum(-1).mean())) for own in residuals]

@@ -21,6 +21,7 @@ MIN_OVERLAP = 0.5  # of the shorter film, at any tested lag
 MIN_AGREEMENT = 0.5  # correlation of the motion in two films
 MIN_VARIATION = 0.1  # of the motion, over its mean; films that show less are not aligned
 MIN_FRAMES = 16
+REPEATED = 0.1  # of the median motion; frames that change less repeat the one before
 GRID = 4  # samples of the motion a frame
 
 
@@ -92,7 +93,10 @@ def films_in(folder: Path) -> list[Path]:
 
 
 def motion(film: Film) -> np.ndarray:
-    """Returns [N - 1], the root mean squared difference between consecutive frames."""
+    """Returns [N - 1], the root mean squared difference between consecutive frames.
+
+    Where a frame was dropped and the one before is shown again, the motion of the next one is spread over both.
+    """
     import cv2
 
     width, height = film.size
@@ -103,14 +107,20 @@ def motion(film: Film) -> np.ndarray:
         if before is not None:
             found.append(float(np.sqrt(np.square(image - before).mean())))
         before = image
+    begin, limit = 0, REPEATED * np.median(found or [0])
+    for end, change in enumerate(found):
+        if change >= limit:
+            found[begin : end + 1] = [change / (end + 1 - begin)] * (end + 1 - begin)
+            begin = end + 1
     return np.array(found)
 
 
 def time_offsets(times: Sequence[np.ndarray], motions: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Aligns films by the motion that they show.
 
-    The lag of two films is the peak of the normalised cross-correlation of their motion; the offsets are the least
-    squares solution of all pairs, weighted by correlation.
+    The lag of two films is the peak of the normalised cross-correlation of the relative change of their motion, which
+    depends less on the view than motion itself; the offsets are the least squares solution of all pairs, weighted by
+    correlation.
 
     Args:
         times: seconds of the frames of each of V films.
@@ -126,7 +136,7 @@ def time_offsets(times: Sequence[np.ndarray], motions: Sequence[np.ndarray]) -> 
     for own, values in zip(times, motions, strict=True):
         middle = (own[1:] + own[:-1]) / 2
         grid = np.arange(middle[0], middle[-1], step)
-        signals.append((middle[0], np.interp(grid, middle, np.log1p(values))))
+        signals.append((middle[0], np.gradient(_smooth(np.interp(grid, middle, np.log1p(values)), GRID))))
     varied = [len(own) >= MIN_FRAMES and own.std() > MIN_VARIATION * own.mean() for own in motions]
     rows, lags, weights, best = [], [], [], np.zeros(n)
     for a in range(n):
@@ -145,6 +155,12 @@ def time_offsets(times: Sequence[np.ndarray], motions: Sequence[np.ndarray]) -> 
     offsets = np.linalg.lstsq(rows * weights[:, None], np.array(lags) * weights, rcond=None)[0]
     offsets[best < MIN_AGREEMENT] = 0
     return offsets - offsets[0] * (best >= MIN_AGREEMENT), best
+
+
+def _smooth(values: np.ndarray, sigma: float) -> np.ndarray:
+    reach = round(4 * sigma)
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    return np.convolve(np.pad(values, reach, mode="edge"), kernel / kernel.sum(), "valid")
 
 
 def _lag(a: np.ndarray, b: np.ndarray, most: int) -> tuple[float, float]:

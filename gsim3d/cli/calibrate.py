@@ -11,7 +11,7 @@ EPILOG = """\
 DIR holds one film a camera, <camera>.mp4, or one folder of such films for each take. The cameras must not move.
 
 With --board, films of a ChArUco board lie in DIR/board (or the films show it themselves): move the board slowly,
-tilted, into all corners of every image, then lay it on the floor in view of two cameras or more. The world is the
+tilted, into all corners of every image, then lay it on the floor in view of a camera. The world is the
 board at the end: z points out of its printed side, lengths are metres. Without --board, COLMAP matches features of
 the still background (pip install 'gsim3d[capture]'); lengths are metres with --scale only.
 

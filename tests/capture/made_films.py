@@ -35,11 +35,11 @@ def rig(angles=(-25, 0, 30), distance=0.66):
 def write_board_films(folder: Path, board, cameras, starts, *, n_frames=N_FRAMES) -> Path:
     """One film of each camera that begins ``starts[c]`` seconds after time 0; the board rests near the end."""
     folder.mkdir(parents=True, exist_ok=True)
-    rng = np.random.default_rng(0)
+    rng, viewer = np.random.default_rng(0), np.mean([np.linalg.inv(camera[2])[:3, 3] for camera in cameras], 0)
     for number, ((name, K, viewmat), start) in enumerate(zip(cameras, starts, strict=True)):
         writer = cv2.VideoWriter(str(folder / f"{name}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), FPS, SIZE)
         times = start + np.arange(n_frames) / FPS
-        for frame in board_film(board, K, viewmat, LENS, SIZE, times, n_frames / FPS - 0.4, number):
+        for frame in board_film(board, K, viewmat, LENS, SIZE, times, n_frames / FPS - 0.4, viewer, number):
             writer.write((frame + rng.normal(0, 1.5, frame.shape)).clip(0, 255).astype(np.uint8))
         writer.release()
     return folder
