@@ -55,7 +55,7 @@ def rays(K: np.ndarray, lens: Iterable[float], size: tuple[int, int], samples: i
 
 
 def board_pose(board: Board, time: float, at_rest: float, viewer: np.ndarray) -> np.ndarray:
-    """Returns board -> world [4, 4]: it swings above the origin, turned to ``viewer``, and rests from ``at_rest`` on."""
+    """Returns board -> world [4, 4]: it swings above the origin, turned to ``viewer``, and rests from ``at_rest``."""
     moving = float(np.clip((at_rest - time) / 0.3, 0, 1))
     width = board.columns * board.square
     # The pace changes, so that the motion of two films matches at one lag only.

@@ -152,7 +152,10 @@ def _intrinsics(film: Film, found: dict[int, tuple]) -> _Views:
             "close up, tilted and in the corners (are --board and --dictionary those of the print?)"
         )
     points, pixels = zip(*found.values(), strict=True)
-    _, K, distortion, turns, shifts = cv2.calibrateCamera(points, pixels, film.size, None, None, flags=cv2.CALIB_FIX_K3)
+    flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    _, K, distortion, turns, shifts = cv2.calibrateCamera(points, pixels, film.size, None, None, flags=flags)
+        points, pixels, film.size, None, None, flags=cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    )
     poses = (_matrix(turn, shift) for turn, shift in zip(turns, shifts, strict=True))
     views = {frame: (*given, pose) for (frame, given), pose in zip(found.items(), poses, strict=True)}
     return _Views(views, K, distortion.reshape(-1)[:5])
@@ -176,28 +179,45 @@ def _initial_poses(names: Sequence[str], views: Sequence[_Views]) -> list[np.nda
 
 
 def _adjust(views, cameras, boards):
-    """Minimises the reprojection errors over poses of cameras (but the first) and boards, by Levenberg-Marquardt."""
-    frames = list(boards)
-    where = {("cam", c): 6 * (c - 1) for c in range(1, len(views))}
-    where |= {("board", f): 6 * (len(views) - 1 + i) for i, f in enumerate(frames)}
-    x = np.zeros(6 * (len(views) - 1 + len(frames)))
-    for (kind, key), at in where.items():
-        x[at : at + 6] = _vector(cameras[key] if kind == "cam" else boards[key])
-    damping, best = 1e-3, None
+    """Minimises the reprojection errors over lenses, cameras and boards, by Levenberg-Marquardt.
+
+    A camera alone, seeing few or grazing boards, leaves its focal lengths and principal point uncertain.
+
+    Args:
+        views: detections of each camera; K and distortion are updated.
+        cameras: poses of the cameras.
+        boards: frame -> pose of the board, in the coordinates of the cameras.
+
+    Returns:
+        Cameras, boards, and the residuals [N, 2] of each view of each camera.
+    """
+    start = {("cam", cam): _vector(pose) for cam, pose in enumerate(cameras)}
+    start |= {("board", frame): _vector(pose) for frame, pose in boards.items()}
+    lenses = [
+        np.array([v.K[0, 0], v.K[1, 1], *v.K[:2, 2], *v.distortion[:2]]) for v in views
+    ]  # cv2.projectPoints' order
+    start |= {("lens", cam): lens for cam, lens in enumerate(lenses)}
+    where = {key: slice(6 * number, 6 * number + 6) for number, key in enumerate(start)}
+    x, damping = np.concatenate(list(start.values())), 1e-3
+    cost, normal, slope, residuals = _linearised(x, views, where)
     for _ in range(ITERATIONS):
-        cost, normal, slope, residuals = _linearised(x, views, where) if best is None else best
-        best = cost, normal, slope, residuals
         step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-9), -slope)
         tried = _linearised(x + step, views, where)
+        damping = damping / 5 if tried[0] < cost else damping * 5
         if tried[0] < cost:
-            x, best, damping = x + step, tried, damping / 5
-            if cost - tried[0] < 1e-9 * cost:
+            gain, x = cost - tried[0], x + step
+            cost, normal, slope, residuals = tried
+            if gain < 1e-9 * cost:
                 break
-        else:
-            damping *= 5
-    cameras = [np.eye(4)] + [_matrix(*np.split(x[6 * c : 6 * c + 6], 2)) for c in range(len(views) - 1)]
-    boards = {f: _matrix(*np.split(x[where["board", f] :][:6], 2)) for f in frames}
-    return cameras, boards, best[3]
+    for cam, view in enumerate(views):
+        view.K, view.distortion = _lens(x[where["lens", cam]])
+    cameras = [_matrix(*np.split(x[where["cam", cam]], 2)) for cam in range(len(views))]
+    return cameras, {frame: _matrix(*np.split(x[where["board", frame]], 2)) for frame in boards}, residuals
+
+
+def _lens(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    fx, fy, cx, cy, k1, k2 = x
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.array([k1, k2, 0, 0, 0])
 
 
 def _linearised(x, views, where):
@@ -207,24 +227,23 @@ def _linearised(x, views, where):
     normal, slope, cost, residuals = np.zeros((len(x), len(x))), np.zeros(len(x)), 0.0, []
     for cam, own in enumerate(views):
         residuals.append([])
-        at_cam = where.get(("cam", cam))
-        turn, shift = (np.zeros(3), np.zeros(3)) if at_cam is None else np.split(x[at_cam : at_cam + 6], 2)
+        lens, pose = where["lens", cam], where["cam", cam]
+        K, distortion = _lens(x[lens])
         for frame, (points, pixels, _) in own.found.items():
-            at = where["board", frame]
-            turn3, shift3, *d = cv2.composeRT(*np.split(x[at : at + 6], 2), turn, shift)
-            projected, jacobian = cv2.projectPoints(points, turn3, shift3, own.K, own.distortion)[:2]
+            board = where["board", frame]
+            turn, shift, *d = cv2.composeRT(*np.split(x[board], 2), *np.split(x[pose], 2))
+            projected, jacobian = cv2.projectPoints(points, turn, shift, K, distortion)[:2]
             off = projected.reshape(-1, 2) - pixels.reshape(-1, 2)
             size = np.linalg.norm(off, axis=1)
             weight = np.repeat(np.minimum(1, LOSS_SCALE / np.maximum(size, 1e-12)), 2)
             cost += np.where(size < LOSS_SCALE, size**2, 2 * LOSS_SCALE * size - LOSS_SCALE**2).sum()
-            of_turn, of_shift = jacobian[:, :3], jacobian[:, 3:6]
-            for_board = np.hstack([of_turn @ d[0] + of_shift @ d[4], of_turn @ d[1] + of_shift @ d[5]])
-            for_cam = np.hstack([of_turn @ d[2] + of_shift @ d[6], of_turn @ d[3] + of_shift @ d[7]])
-            parts = [(at, for_board)] + ([] if at_cam is None else [(at_cam, for_cam)])
-            for begin, J in parts:
-                slope[begin : begin + 6] += J.T @ (weight * off.ravel())
+            parts = [(lens, jacobian[:, 6:12])]
+            for at, k in ((board, 0), (pose, 2)):
+                parts.append((at, jacobian[:, :6] @ np.block([[d[k], d[k + 1]], [d[k + 4], d[k + 5]]])))
+            for at, J in parts:
+                slope[at] += J.T @ (weight * off.ravel())
                 for other, J2 in parts:
-                    normal[begin : begin + 6, other : other + 6] += J.T @ (weight[:, None] * J2)
+                    normal[at, other] += J.T @ (weight[:, None] * J2)
             residuals[-1].append(off)
     return cost, normal, slope, residuals
 
