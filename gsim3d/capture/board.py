@@ -154,8 +154,6 @@ def _intrinsics(film: Film, found: dict[int, tuple]) -> _Views:
     points, pixels = zip(*found.values(), strict=True)
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
     _, K, distortion, turns, shifts = cv2.calibrateCamera(points, pixels, film.size, None, None, flags=flags)
-        points, pixels, film.size, None, None, flags=cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
-    )
     poses = (_matrix(turn, shift) for turn, shift in zip(turns, shifts, strict=True))
     views = {frame: (*given, pose) for (frame, given), pose in zip(found.items(), poses, strict=True)}
     return _Views(views, K, distortion.reshape(-1)[:5])
