@@ -16,6 +16,9 @@ from gsim3d.synth.embedding import ParticleCloud, RigidFrame
 from gsim3d.synth.scene_setup import Pusher, Unstable
 from gsim3d.synth.world import SceneBody, SceneDraw, World
 
+# Options of World that have no effect where bodies rest at time 0 on a ground at height 0.
+RESTING = ("drop_height", "speed", "lift", "spin", "spread", "max_timestep")
+RESTING += ("ground", "ground_height", "meshes", "mesh_up")
 SCRIPTED = 0.75  # fraction of scenes whose pusher pushes a body to a goal; others go from place to place
 PUSH_DISTANCE = (0.35, 0.8)  # metres between a body and its goal
 START_DISTANCE = (0.34, 0.46)  # metres between the pusher and the body that it pushes first
@@ -97,11 +100,10 @@ class Push(World):
     name = "push"
     engines = ("mujoco",)
     actors = ("pusher",)
+    unused = RESTING
 
     def check(self) -> None:
         super().check()
-        if self.meshes:
-            raise InputError("meshes: the world push has no mesh files; leave them out")
         low, high = self.push_speed
         if not 0 < low <= high < np.inf:
             raise InputError(f"push_speed must be two positive numbers, the smaller first; got {low} {high}")

@@ -9,7 +9,7 @@ import numpy as np
 
 from gsim3d.errors import InputError
 from gsim3d.synth import mujoco_engine, render, scene_setup
-from gsim3d.synth.acting import smooth_path
+from gsim3d.synth.acting import RESTING, smooth_path
 from gsim3d.synth.embedding import ClothGrid, ParticleCloud
 from gsim3d.synth.scene_setup import Cloth, SceneSetup, Unstable
 from gsim3d.synth.shapes import icosphere
@@ -48,12 +48,11 @@ class ClothGrip(World):
     engines = ("mujoco",)
     actors = ("gripper", "gripper")
     known_objects = ("cloth",)
+    unused = (*(name for name in RESTING if name != "max_timestep"), "objects", "n_bodies", "body_size")
 
     def check(self) -> None:
         super().check()
         self._check_counts(cloth_count=3)
-        if self.meshes:
-            raise InputError("meshes: the world cloth-grip has no bodies; leave them out")
         for field in ("cloth_width", "cloth_mass", "cloth_young", "grip_speed"):
             low, high = getattr(self, field)
             if not 0 < low <= high < np.inf:

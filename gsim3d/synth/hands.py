@@ -11,9 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsim3d.errors import InputError
 from gsim3d.synth import pushing, render, scene_setup
-from gsim3d.synth.acting import smooth_path
+from gsim3d.synth.acting import RESTING, smooth_path
 from gsim3d.synth.embedding import ParticleCloud, RigidFrame
 from gsim3d.synth.scene_setup import Unstable
 from gsim3d.synth.shapes import icosphere
@@ -98,11 +97,7 @@ class Hands(World):
     name = "hands"
     engines = ("mujoco",)
     actors = TYPES
-
-    def check(self) -> None:
-        super().check()
-        if self.meshes or self.n_bodies != (1, 1):
-            raise InputError("the world hands has one body, from objects; leave meshes and n_bodies out")
+    unused = (*RESTING, "n_bodies")
 
     def _draw(self, name, rng):
         place, angle = PLACE * rng.uniform(-1, 1, 2), rng.uniform(0, 2 * np.pi)

@@ -119,6 +119,7 @@ class World(ABC):
     name = ""
     engines = tuple(ENGINES)
     known_objects = OBJECTS
+    unused = ()  # options without effect, which are refused
     actors = ()  # types of the actors' points; a scene has the first of them
 
     def check(self) -> None:

@@ -196,6 +196,8 @@ def build_world(world: str, preset: str, changes: dict) -> World:
     if unknown:
         hint = did_you_mean(unknown[0], known)
         raise InputError(f"world {world!r} has no option {unknown[0]!r}; it has {', '.join(sorted(known))}{hint}")
+    if ignored := sorted(set(changes) & set(WORLDS[world].unused)):
+        raise InputError(f"world {world!r} does not use the option {ignored[0]!r}; leave it out")
     subset = changes.get("subset", TRAIN)
     sets = {TRAIN: {}, **{name: worlds[world] for name, worlds in HELD_OUT[preset].items() if world in worlds}}
     if subset not in sets:

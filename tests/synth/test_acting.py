@@ -102,7 +102,9 @@ def test_hands_carry_the_body():
     assert min(lifted) > 0.1
 
 
-def test_push_refuses_mesh_files(tmp_path):
-    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n")
-    with pytest.raises(InputError, match="push has no mesh files"):
-        build_world("push", "mini", {"meshes": (str(tmp_path / "a.obj"),)})
+@pytest.mark.parametrize(
+    "name, option", [("push", "meshes"), ("push", "drop_height"), ("hands", "n_bodies"), ("cloth-grip", "body_size")]
+)
+def test_options_without_effect_are_refused(name, option):
+    with pytest.raises(InputError, match=f"world '{name}' does not use the option '{option}'"):
+        build_world(name, "mini", {option: (0.1, 0.2)})
