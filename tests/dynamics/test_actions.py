@@ -152,8 +152,9 @@ def test_scenes_of_a_batch_equal_those_alone(name):
     assert frames.actions is None
 
 
-def test_gradients_flow_to_positions_and_embeddings():
-    simulator, state, actions = setting()
+@pytest.mark.parametrize("name", CONFIGS)
+def test_gradients_flow_to_positions_and_embeddings(name):
+    simulator, state, actions = setting(CONFIGS[name])
     positions = actions.positions.clone().requires_grad_()
     steps = simulator.rollout(given(state, dataclasses.replace(actions, positions=positions)), STEPS)
     module = simulator.dynamics.actions
