@@ -12,7 +12,7 @@ import numpy as np
 from gsim3d.capture.board import Board, Calibrated, calibrate_board
 from gsim3d.capture.films import BOARD, MIN_AGREEMENT, Film, films_in, motion, takes_of, time_offsets
 from gsim3d.capture.sfm import calibrate_sfm
-from gsim3d.data.videos import FILE
+from gsim3d.data.videos import FILE, SAME_RATE
 from gsim3d.errors import InputError
 from gsim3d.io.files import write_whole
 
@@ -69,7 +69,7 @@ def calibrate(
         say(f"{take}:")
         offsets, agreement = _offsets(films, say)
         written.append(take / FILE)
-        write_whole(take / FILE, _description(cameras, offsets, agreement, "board" if board else "sfm"))
+        write_whole(take / FILE, _description(cameras, offsets, agreement, _common_rate(films, say)))
     say(f"calibrate: wrote {', '.join(map(str, written))}")
     return written
 
@@ -109,7 +109,16 @@ def _scaled(cameras: list[Calibrated], scale, metric: bool, say) -> list[Calibra
     return [dataclasses.replace(c, viewmat=np.vstack([c.viewmat[:3] * step, c.viewmat[3:]])) for c in cameras]
 
 
-def _description(cameras: Sequence[Calibrated], offsets, agreement, method: str) -> str:
+def _common_rate(films: Sequence[Film], say: Callable[[str], None]) -> float | None:
+    """Returns the rate to which films of uneven or different rates are resampled; None if they are even and equal."""
+    rates = [1 / float(np.median(np.diff(film.video.times))) for film in films]
+    if all(film.video.rate for film in films) and max(rates) / min(rates) - 1 < SAME_RATE:
+        return None
+    say(f"  resampled to {min(rates):.5g} frames a second: the films have {', '.join(f'{rate:.5g}' for rate in rates)}")
+    return min(rates)
+
+
+def _description(cameras: Sequence[Calibrated], offsets, agreement, resample: float | None) -> str:
     entries = [
         {
             "name": camera.name,
@@ -123,5 +132,5 @@ def _description(cameras: Sequence[Calibrated], offsets, agreement, method: str)
         }
         for camera, offset, own in zip(cameras, offsets, agreement, strict=True)
     ]
-    content = {"pixel_center": 0, "calibrated_by": method, "cameras": entries}
+    content = {"pixel_center": 0, **({} if resample is None else {"resample": resample}), "cameras": entries}
     return json.dumps(content, indent=1) + "\n"

@@ -14,7 +14,7 @@ import numpy as np
 from gsim3d.capture.check import angles
 from gsim3d.data import Scene
 from gsim3d.data.cameras import nearest_point, positions_and_axes
-from gsim3d.data.fitting import Fitting, scale_colors, scale_labels
+from gsim3d.data.fitting import Fitting, frame_stride, scale_colors, scale_labels
 from gsim3d.data.recording import BACKGROUND, MOVING, evenly_spaced
 from gsim3d.data.scene import SIZE_MULTIPLE
 from gsim3d.data.videos import FILE
@@ -28,6 +28,7 @@ PRESETS = {"cpu": "tiny", "cuda": "small"}
 HISTORY = {"cpu": 2, "cuda": 4}
 SAMPLES = 24  # steps of a take at which masks are looked at
 MARGIN = 0.15  # around the moving bodies, of the size of their box
+MOST = 0.95  # of the pixels of a mask, and of the steps, that the box around moving bodies encloses
 DEPTH_MARGINS = (0.85, 1.15)  # around the depths of the moving bodies
 HELD_OUT_SHARE = 0.15  # of a single take, its last steps
 
@@ -71,7 +72,7 @@ def open_take(folder: Path, cache: Path, fps: float | None = None) -> Scene:
 def propose(takes: Sequence[Scene], device: str, say: Callable[[str], None]) -> Proposal:
     """Decides how the takes of a capture are prepared, and says why."""
     first = takes[0]
-    if any((take.fps, take.n_cams) != (first.fps, first.n_cams) for take in takes):
+    if any(frame_stride(take.fps, first.fps) != 1 or take.n_cams != first.n_cams for take in takes):
         raise InputError("the takes differ in frame rate or number of cameras; capture them in folders of their own")
     say(f"  rate: {first.fps:g} frames a second, nearest to {WANTED_FPS:g}: steps large enough to see motion")
     has_masks = all(take.has_segmentation() for take in takes)
@@ -87,15 +88,9 @@ def propose(takes: Sequence[Scene], device: str, say: Callable[[str], None]) -> 
     stride = max(1, int(np.ceil(np.sqrt(particles / PARTICLES[device]))))
     limit = PARTICLES[device]
     say(f"  stride: {stride}, so that a step has about {particles / stride**2:.0f} particles (limit {limit})")
-    bounds = _bounds(takes) if has_masks else None
-    depths = first.near, first.far
-    if bounds is not None:
-        corners = np.array([[bounds[k >> axis & 1][axis] for axis in range(3)] for k in range(8)])
-        viewmats = first.recording.viewmats[0]
-        depth = corners @ viewmats[:, 2, :3].T + viewmats[:, 2, 3]
-        if depth.min() > 0:
-            depths = float(DEPTH_MARGINS[0] * depth.min()), float(DEPTH_MARGINS[1] * depth.max())
-    why = "around the moving bodies" if bounds is not None else "of the cameras"
+    extent = _extent(takes) if has_masks else None
+    bounds, depths = extent or (None, (first.near, first.far))
+    why = "around the moving bodies" if extent else "of the cameras"
     say(f"  depth: {depths[0]:.2f} to {depths[1]:.2f} m, {why}")
     held_out = _held_out_camera(first) if first.n_cams > 3 else None
     if held_out is None:
@@ -145,15 +140,15 @@ def _shaped(box: tuple, size: tuple[int, int], image: tuple[int, int]) -> tuple[
     return *corner, *wanted
 
 
-def _bounds(takes: Sequence[Scene]) -> list | None:
-    """Returns the box [2][3] around spheres that enclose the moving bodies at some steps; None if it is unknown.
+def _extent(takes: Sequence[Scene]) -> tuple[list, tuple[float, float]] | None:
+    """Returns the box [2][3] in which bodies move, and the range of their depths; None if it is unknown.
 
-    The centre of a sphere is nearest to the rays through the centroids of the masks. Unlike visual hulls, spheres do
-    not stretch along the view of cameras that lie close together.
+    At each of some steps, a sphere encloses the bodies: its centre is nearest to the rays through the centroids of the
+    masks. Unlike visual hulls, spheres do not stretch along the view of cameras that lie close together.
     """
     viewmats, Ks = takes[0].recording.cameras_at_step(0)
     centres, _ = positions_and_axes(viewmats)
-    found = []
+    low, high, depths = [], [], []
     for take in takes:
         for step in evenly_spaced(take.n_steps, SAMPLES):
             masks = (take.segmentation(range(take.n_cams), [step])[0] == MOVING).numpy()
@@ -162,14 +157,17 @@ def _bounds(takes: Sequence[Scene]) -> list | None:
             middles = np.array([[*own.mean(0), 1] for own in pixels])
             rays = [viewmats[c, :3, :3].T @ np.linalg.solve(Ks[c], middle) for c, middle in zip(seen, middles)]
             point = nearest_point(centres[seen], np.array(rays)) if len(seen) > 1 else None
-            if point is None:
-                continue
-            depths = viewmats[seen, 2, :3] @ point + viewmats[seen, 2, 3]
-            spans = [np.linalg.norm(own - m[:2], axis=1).max() for own, m in zip(pixels, middles)]
-            radius = (np.array(spans) * depths / Ks[seen, 0, 0]).max()
-            found.append((point - radius, point + radius))
-    boxes = np.array(found)
-    return np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)]).tolist() if found else None
+            if point is not None:
+                depth = viewmats[seen, 2, :3] @ point + viewmats[seen, 2, 3]
+                spans = [np.quantile(np.linalg.norm(own - m[:2], axis=1), MOST) for own, m in zip(pixels, middles)]
+                radius = np.median(np.array(spans) * depth / Ks[seen, 0, 0])
+                low, high = [*low, point - radius], [*high, point + radius]
+                depths.append((depth.min() - radius, depth.max() + radius))
+    if not depths:
+        return None
+    near, far = (float(np.quantile([d[end] for d in depths], q)) for end, q in ((0, 1 - MOST), (1, MOST)))
+    bounds = [np.quantile(corners, q, 0).tolist() for corners, q in ((low, 1 - MOST), (high, MOST))]
+    return (bounds, (DEPTH_MARGINS[0] * near, DEPTH_MARGINS[1] * far)) if near > 0 else None
 
 
 def _held_out_camera(scene: Scene) -> int:

@@ -16,8 +16,10 @@ import numpy as np
 from gsim3d.capture import check, prepare
 from gsim3d.capture.board import Board
 from gsim3d.capture.calibrate import calibrate
+from gsim3d.capture.films import BOARD, films_in
 from gsim3d.data import Scene, find_scenes, split_scenes
 from gsim3d.data.check import check_scene
+from gsim3d.data.videos import FILE
 from gsim3d.errors import InputError
 from gsim3d.evaluate.protocol import score_scene
 from gsim3d.io.files import write_whole
@@ -106,12 +108,12 @@ class _Run:
 
     def calibrate(self, board: Board | None, scale) -> None:
         """Writes cameras.json where films have none."""
-        try:
-            takes = find_scenes(self.folder)
-        except InputError:
+        below = [path for path in self.folder.glob("*/") if path.name != BOARD]
+        filmed = [take for take in (self.folder, *below) if films_in(take)]
+        if all((take / FILE).is_file() for take in filmed):
+            self.say(f"calibrate: done, or cameras given ({', '.join(s.name for s in find_scenes(self.folder))})")
+        else:
             calibrate(self.folder, board=board, scale=scale, force=self.force, say=self.say)
-            return
-        self.say(f"calibrate: done, or cameras given ({', '.join(take.name for take in takes)})")
 
     def check(self) -> dict:
         """Refuses what cannot be learned from, unless forced."""
