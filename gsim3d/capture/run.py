@@ -108,12 +108,18 @@ class _Run:
 
     def calibrate(self, board: Board | None, scale) -> None:
         """Writes cameras.json where films have none."""
-        below = [path for path in self.folder.glob("*/") if path.name != BOARD]
+        if not self.folder.is_dir():
+            raise InputError(f"{self.folder} is not a folder")
+        below = [path for path in self.folder.iterdir() if path.is_dir() and path.name != BOARD]
         filmed = [take for take in (self.folder, *below) if films_in(take)]
-        if all((take / FILE).is_file() for take in filmed):
-            self.say(f"calibrate: done, or cameras given ({', '.join(s.name for s in find_scenes(self.folder))})")
-        else:
+        if filmed and not all((take / FILE).is_file() for take in filmed):
             calibrate(self.folder, board=board, scale=scale, force=self.force, say=self.say)
+            return
+        try:
+            names = [path.name for path in find_scenes(self.folder)]
+        except InputError as error:
+            raise InputError(f"{error}; and no films <camera>.mp4") from None
+        self.say(f"calibrate: done, or cameras given ({', '.join(names)})")
 
     def check(self) -> dict:
         """Refuses what cannot be learned from, unless forced."""
@@ -135,9 +141,7 @@ class _Run:
         nearest = np.where(np.eye(len(angles), dtype=bool), np.inf, angles).min(1)
         self.say(f"  angles to the nearest camera: {', '.join(f'{angle:.0f}' for angle in nearest)} degrees")
         worst = max((error for error, _ in errors.values()), default=None)
-        fit = (
-            "too few matches to judge" if worst is None else f"at most {worst:.2f} px ({len(errors)} pairs of cameras)"
-        )
+        fit = "too few to judge" if worst is None else f"at most {worst:.2f} px ({len(errors)} pairs of cameras)"
         self.say(f"  reprojection error of matched features: {fit}")
         if problems and not self.force:
             more = f" (and {len(problems) - 1} more problems)" if len(problems) > 1 else ""

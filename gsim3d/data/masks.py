@@ -9,6 +9,7 @@ import numpy as np
 from gsim3d.data.recording import evenly_spaced
 
 BACKGROUND_STEPS = 51  # evenly spaced steps from which the background is computed
+CANDIDATES = 17  # steps whose colours may be the background's
 SAME_COLOR = 9  # largest difference of a channel between equal colours, of 255
 ROWS = 32  # of the images that are compared at a time
 MIN_STEPS = 8  # fewest steps from which a background is estimated
@@ -47,7 +48,7 @@ def _most_frequent(frames: np.ndarray) -> np.ndarray:
     """Returns the mean [h, w, 3] of the largest set of values of a pixel around one of them, uint8 [S, h, w, 3]."""
     best = np.zeros(frames.shape[1:3], np.int32)
     result = frames[0].copy()
-    for frame in frames:
+    for frame in frames[:: -(-len(frames) // CANDIDATES)]:
         near = (np.maximum(frames, frame) - np.minimum(frames, frame)).max(-1) <= SAME_COLOR
         count = near.sum(0)
         mean = (frames * near[..., None].astype(np.uint16)).sum(0) / count[..., None]

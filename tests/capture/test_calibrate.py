@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from gsim3d.capture.board import Board
-from gsim3d.capture.calibrate import calibrate
-from gsim3d.capture.films import Film, time_offsets
+from gsim3d.capture.calibrate import _common_rate, calibrate
+from gsim3d.capture.films import Film, takes_of, time_offsets
 from gsim3d.cli.main import main
 from gsim3d.data import Scene, find_scenes
 from gsim3d.data.lenses import Undistorter
@@ -17,6 +17,7 @@ from gsim3d.data.recording import Lens, Problems
 from gsim3d.data.video_file import Video
 from gsim3d.errors import InputError
 from tests.capture.made_films import FPS, SIZE, rig, write_board_films, write_textured_films
+from tests.data.made_videos import with_gaps, write_plain
 from tests.tiny_scenes import write_scenes
 from tools.films import Damage, degraded, write_films
 
@@ -158,3 +159,31 @@ def test_films_of_generated_scenes_have_the_true_cameras(tmp_path):
     damaged = list(degraded(frames, Damage(dropped=0.5), 1.1, np.random.default_rng(0)))
     repeated = [(a == b).all() for a, b in zip(damaged, damaged[1:])]
     assert 8 < sum(repeated) < 22 and not (damaged[0] == damaged[-1]).all()
+
+
+def test_films_of_uneven_rates_are_resampled(tmp_path):
+    with_gaps(write_plain(tmp_path / "a.mkv"), [50] * 9 + [60] * 10)
+    write_plain(tmp_path / "b.mp4")
+    films = [Film.open(tmp_path / name) for name in ("a.mkv", "b.mp4")]
+    assert _common_rate(films, lambda _: None) == pytest.approx(1000 / 60, rel=0.01)
+    assert _common_rate(films[1:] * 2, lambda _: None) is None
+
+
+def test_takes_are_found_or_refused(tmp_path, capsys):
+    assert main(["capture", str(tmp_path), "--out", str(tmp_path / "run")]) == 2
+    assert "and no films <camera>.mp4" in capsys.readouterr().err
+    for take in ("one", "two", "board"):
+        (tmp_path / take).mkdir()
+        for name in ("left", "right"):
+            write_plain(tmp_path / take / f"{name}.mp4")
+    assert {take.name: [file.stem for file in films] for take, films in takes_of(tmp_path).items()} == {
+        "one": ["left", "right"],
+        "two": ["left", "right"],
+    }
+    (tmp_path / "two" / "right.mp4").unlink()
+    with pytest.raises(InputError, match=r"two: has films of left; every take needs .* same two cameras"):
+        takes_of(tmp_path)
+    assert main(["calibrate", str(tmp_path), "--board", "7x5"]) == 2
+    assert "--board and --square belong together" in capsys.readouterr().err
+    assert main(["calibrate", str(tmp_path), "--scale", "left=3"]) == 2
+    assert "must be CAMERA:CAMERA=METRES" in capsys.readouterr().err
