@@ -58,13 +58,13 @@ class Proposal:
     held_out_camera: int | None
 
 
-def open_take(folder: Path, cache: Path, fps: float | None = None) -> Scene:
-    """Opens a take in working size, at ``fps`` or the rate nearest to WANTED_FPS that divides its own."""
+def open_take(folder: Path, cache: Path) -> Scene:
+    """Opens a take in working size, at the rate nearest to WANTED_FPS that divides its own."""
     recorded = Scene.open(folder)
     width, height = (max(side) for side in zip(*recorded.recorded_sizes, strict=True))
     share = WORKING_SIDE / max(width, height)
     size = (round(width * share), round(height * share)) if share < 1 else None
-    rate = fps or recorded.fps / max(1, round(recorded.fps / WANTED_FPS))
+    rate = recorded.fps / max(1, round(recorded.fps / WANTED_FPS))
     cache.mkdir(parents=True, exist_ok=True)
     return Scene.open(folder, cache_dir=cache, fitting=Fitting(size, enlarge=True, whole=True), fps=rate)
 
@@ -76,17 +76,18 @@ def propose(takes: Sequence[Scene], device: str, say: Callable[[str], None]) -> 
         raise InputError("the takes differ in frame rate or number of cameras; capture them in folders of their own")
     say(f"  rate: {first.fps:g} frames a second, nearest to {WANTED_FPS:g}: steps large enough to see motion")
     has_masks = all(take.has_segmentation() for take in takes)
-    boxes, pixels = _boxes(takes) if has_masks else (_whole(first), max(w * h for w, h in first.recording.sizes))
+    sizes = first.recording.sizes
+    boxes, pixels = _boxes(takes) if has_masks else ([(0, 0, *size) for size in sizes], max(w * h for w, h in sizes))
     aspect = float(np.median([box[2] / box[3] for box in boxes]))
     longer = min(SIDES[device], max(max(box[2:]) for box in boxes))
     size = _multiples(longer * min(1, aspect), longer * min(1, 1 / aspect))
-    crops = [_shaped(box, size, image) for box, image in zip(boxes, first.recording.sizes, strict=True)]
+    crops = [_shaped(box, size, image) for box, image in zip(boxes, sizes, strict=True)]
     what = f"where bodies move, and {MARGIN:.0%} around" if has_masks else "the whole image, because there are no masks"
     say(f"  crop: {what}; scaled to {size[0]}x{size[1]} pixels, what a model for {device} affords")
     scale = max(size[0] / crop[2] for crop in crops)
     particles = pixels * scale**2 * first.n_cams
-    stride = max(1, int(np.ceil(np.sqrt(particles / PARTICLES[device]))))
     limit = PARTICLES[device]
+    stride = max(1, int(np.ceil(np.sqrt(particles / limit))))
     say(f"  stride: {stride}, so that a step has about {particles / stride**2:.0f} particles (limit {limit})")
     extent = _extent(takes) if has_masks else None
     bounds, depths = extent or (None, (first.near, first.far))
@@ -94,7 +95,8 @@ def propose(takes: Sequence[Scene], device: str, say: Callable[[str], None]) -> 
     say(f"  depth: {depths[0]:.2f} to {depths[1]:.2f} m, {why}")
     held_out = _held_out_camera(first) if first.n_cams > 3 else None
     if held_out is None:
-        say("  held out: no camera, because there are only 3; each is predicted from the particles of the others")
+        why = f"there are only {first.n_cams}; each is drawn from the particles of the others"
+        say(f"  held out: no camera, because {why}")
     else:
         say(f"  held out: camera {first.camera_names[held_out]}, which the others surround best")
     working = first.fitting.size
@@ -119,10 +121,6 @@ def _boxes(takes: Sequence[Scene]) -> tuple[list[tuple], float]:
         low.append((max(0, x[0] - border), max(0, y[0] - border)))
         high.append((min(width, x[-1] + 1 + border), min(height, y[-1] + 1 + border)))
     return [(*a, b[0] - a[0], b[1] - a[1]) for a, b in zip(low, high, strict=True)], max(counts)
-
-
-def _whole(scene: Scene) -> list[tuple]:
-    return [(0, 0, width, height) for width, height in scene.recording.sizes]
 
 
 def _multiples(width: float, height: float) -> tuple[int, int]:

@@ -50,7 +50,7 @@ def draw_left_out(
     """
     images, number = [], torch.arange(len(cameras), device=particles.means.device).view(-1, n_views)
     for view in range(n_views):
-        opacities = torch.where(particles.view == view, 0, particles.opacities)
+        opacities = particles.opacities.masked_fill(particles.view == view, 0)
         others = dataclasses.replace(particles, opacities=opacities)
         images.append(draw(others, cameras.select(number[:, view])))
     return torch.stack(images, 1).flatten(0, 1)
