@@ -137,7 +137,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     write_films(args.data, args.out, args.cameras, seed=args.seed)
-    print(f"films in {args.out}; board {BOARD.columns}x{BOARD.rows}, squares of {BOARD.square} m")
+    print(f"films in {args.out}: --board {BOARD.columns} {BOARD.rows} {BOARD.square}")
 
 
 if __name__ == "__main__":

@@ -102,7 +102,7 @@ def _scaled(cameras: list[Calibrated], scale, metric: bool, say) -> list[Calibra
     centres = {c.name: -c.viewmat[:3, :3].T @ c.viewmat[:3, 3] for c in cameras}
     first, second, metres = scale
     if first == second or not {first, second} <= set(centres):
-        raise InputError(f"--scale: {first}:{second} must be two of the cameras {', '.join(centres)}")
+        raise InputError(f"--scale: {first} and {second} must be two of the cameras {', '.join(centres)}")
     share = metres / float(np.linalg.norm(centres[first] - centres[second]))
     say(f"  scale: {first} and {second} are {metres:g} m apart, lengths are multiplied by {share:.4g}")
     step = np.array([1.0, 1.0, 1.0, share])

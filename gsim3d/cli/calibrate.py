@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from gsim3d.cli.arguments import number
+from gsim3d.errors import InputError
 
 EPILOG = """\
 DIR holds one film a camera, <camera>.mp4, or one folder of such films for each take. The cameras must not move.
@@ -19,8 +20,8 @@ Films that start at different times are aligned by the motion that they show. Wr
 (docs/reference/data.md, videos), with the reprojection error of each camera.
 
 examples:
-  gsim3d calibrate films --board 7x5 --square 0.04
-  gsim3d calibrate films --scale left:right=1.2
+  gsim3d calibrate films --board 7 5 0.04
+  gsim3d calibrate films --scale left right 1.2
 """
 
 
@@ -34,43 +35,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_calibration(parser: argparse.ArgumentParser) -> None:
     """Adds the options that describe the board or the scale."""
-    add, length = parser.add_argument, number(0, 10, above=True)
-    add("--board", type=_squares, metavar="CxR", help="columns x rows of squares of a ChArUco board, such as 7x5")
-    add("--square", type=length, metavar="M", help="side of its squares, metres")
+    add, length = parser.add_argument, number(0, above=True)
+    board = ("COLUMNS", "ROWS", "SIDE")
+    add("--board", nargs=3, type=length, metavar=board, help="squares of a ChArUco board, and their side in metres")
     add("--marker", type=length, metavar="M", default=0.0, help="side of its markers, metres (default: 0.75 squares)")
     add("--dictionary", default="4X4_50", help="its markers, by OpenCV's name (default: 4X4_50)")
-    add("--scale", type=_scale, metavar="A:B=M", help="distance between two cameras, metres, such as left:right=1.2")
+    add("--scale", nargs=3, metavar=("A", "B", "M"), help="two cameras and the distance between them in metres")
 
 
 def calibration_of(args: argparse.Namespace) -> dict[str, Any]:
     """Returns the arguments ``board`` and ``scale`` of :func:`gsim3d.capture.calibrate.calibrate`."""
     from gsim3d.capture.board import Board
-    from gsim3d.errors import InputError
 
-    if (args.board is None) != (args.square is None):
-        raise InputError("--board and --square belong together")
-    board = args.board and Board(*args.board, args.square, args.marker, args.dictionary)
-    return {"board": board, "scale": args.scale}
-
-
-def _squares(text: str) -> tuple[int, int]:
-    try:
-        columns, rows = map(int, text.lower().split("x"))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"must be COLUMNSxROWS, such as 7x5; got {text!r}") from None
-    return columns, rows
-
-
-def _scale(text: str) -> tuple[str, str, float]:
-    names, _, metres = text.rpartition("=")
-    first, colon, second = names.partition(":")
-    try:
-        length = float(metres)
-    except ValueError:
-        length = 0.0
-    if not colon or not 0 < length < float("inf"):
-        raise argparse.ArgumentTypeError(f"must be CAMERA:CAMERA=METRES, such as left:right=1.2; got {text!r}")
-    return first, second, length
+    board = scale = None
+    if args.board:
+        columns, rows, side = args.board
+        board = Board(int(columns), int(rows), side, args.marker, args.dictionary)
+    if args.scale:
+        first, second, metres = args.scale
+        try:
+            scale = first, second, number(0, above=True)(metres)
+        except (ValueError, argparse.ArgumentTypeError):
+            raise InputError(f"--scale: M must be a positive number of metres; got {metres!r}") from None
+    return {"board": board, "scale": scale}
 
 
 def run(args: argparse.Namespace) -> int:

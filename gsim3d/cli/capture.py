@@ -20,7 +20,7 @@ Refused unless --force: cameras further than 45 degrees from their nearest neigh
 Delete a file in OUT to repeat its step.
 
 examples:
-  gsim3d capture films --board 7x5 --square 0.04 --out runs/capture --device cuda
+  gsim3d capture films --board 7 5 0.04 --out runs/capture --device cuda
   gsim3d capture scene_with_cameras --out runs/capture --minutes 5
 """
 
