@@ -64,14 +64,7 @@ def read(folder: Path, problems: Problems) -> Recording:
     cameras, n_steps = sequence.cameras(), sequence.n_steps
     notes = [*sequence.notes, *sequence.check_rig(cameras)]
     positions, valid = sequence.joints(cameras)
-    known = valid.all(0)
-    if len(lost := [name for name, ok in zip(sequence.types, known) if not ok]):
-        hands = ", ".join(dict.fromkeys(name.partition("_")[0] for name in lost))
-        notes.append(f"{hands} hand: {len(lost)} joints without positions at some frames are no actions")
-    actions = None
-    if known.any():
-        names = tuple(name for name, ok in zip(sequence.types, known) if ok)
-        actions = RecordedActions(positions[:, known].astype(np.float64), names)
+    actions = _actions(positions, valid, sequence.types, notes)
     near, far = _depths(np.stack([camera.viewmats for camera in cameras]))
     return Recording.of_cameras(
         cameras,
@@ -104,6 +97,21 @@ def hand_keypoints(folder: str | Path, problems: Problems | None = None) -> tupl
     """
     sequence = _Sequence(Path(folder), problems or Problems())
     return sequence.joints(sequence.cameras())
+
+
+def _actions(
+    positions: np.ndarray, valid: np.ndarray, types: Sequence[str], notes: list[str]
+) -> RecordedActions | None:
+    """Returns the joints that are ever known, held at the nearest known position elsewhere; appends notes about that."""
+    points, held = np.flatnonzero(valid.any(0)), positions.astype(np.float64)
+    for point in points:
+        known = np.flatnonzero(valid[:, point])
+        held[:, point] = held[known[np.searchsorted((known[1:] + known[:-1]) / 2, np.arange(len(valid)))], point]
+    for side in SIDES:
+        absent = max((int((~valid[:, point]).sum()) for point in points if types[point].startswith(side)), default=0)
+        if absent:
+            notes.append(f"{side} hand: absent at {absent} of {len(valid)} frames, held where it was last or next")
+    return RecordedActions(held[:, points], tuple(types[point] for point in points)) if len(points) else None
 
 
 def _depths(viewmats: np.ndarray) -> tuple[float, float]:

@@ -78,10 +78,13 @@ def test_joints_are_world_positions_with_short_gaps_interpolated(folder):
     assert not valid[20:27, 21:].any() and (positions[20:27, 21:] == 0).all()
 
 
-def test_actions_are_the_hands_that_are_always_known(scene, tmp_path):
+def test_actions_are_the_joints_held_in_long_gaps(scene, tmp_path):
     actions = scene.recording.actions
-    assert actions.types == tuple(f"right_{joint}" for joint in range(21))
-    assert any("left hand: 21 joints without positions" in note for note in scene.recording.notes)
+    assert actions.types == tuple(TYPES)
+    assert any("left hand: absent at 7 of 32 frames" in note for note in scene.recording.notes)
+    assert not any("right hand" in note for note in scene.recording.notes)
+    np.testing.assert_allclose(actions.positions[20:23, 21:], np.stack([hand("left", 19)] * 3), atol=1e-5)
+    np.testing.assert_allclose(actions.positions[24:27, 21:], np.stack([hand("left", 27)] * 3), atol=1e-5)
     whole = Scene.open(write_hocap(tmp_path, gaps=False, n_frames=8), fps=15)
     assert len(whole.recording.actions.types) == 42
     for step in range(4):  # frames 0, 2, 4, 6
