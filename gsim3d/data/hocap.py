@@ -102,7 +102,7 @@ def hand_keypoints(folder: str | Path, problems: Problems | None = None) -> tupl
 def _actions(
     positions: np.ndarray, valid: np.ndarray, types: Sequence[str], notes: list[str]
 ) -> RecordedActions | None:
-    """Returns the joints that are ever known, held at the nearest known position elsewhere; appends notes about that."""
+    """Returns the joints that are ever known, held at the nearest known position elsewhere; adds notes."""
     points, held = np.flatnonzero(valid.any(0)), positions.astype(np.float64)
     for point in points:
         known = np.flatnonzero(valid[:, point])
