@@ -57,6 +57,8 @@ def load_depth_weights(encoder: Encoder, path: str | Path) -> list[str]:
     """
     if encoder.config.backbone != "vit_dpt":
         raise InputError(f"{path}: needs an encoder with backbone vit_dpt; this one has {encoder.config.backbone}")
+    if not Path(path).is_file():  # reading a pipe would never end
+        raise InputError(f"{path}: no such file")
     try:
         tensors = load_file(path)
     except (OSError, SafetensorError, ValueError) as error:

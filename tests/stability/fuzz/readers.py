@@ -41,7 +41,7 @@ from gsim3d.evaluate.perceptual.convert import read_onnx
 from gsim3d.evaluate.plan_report import TIMES, load_times
 from gsim3d.evaluate.predictions import Predictions
 from gsim3d.io import checkpoint, read_particles, read_ply, read_splats, write_particles, write_ply, write_splats
-from gsim3d.io.files import read_yaml
+from gsim3d.io.files import read_file, read_yaml
 from gsim3d.io.sequence import open_sequence, write_about
 from gsim3d.io.settings import from_dict, to_dict
 from gsim3d.nn.multiview_encoder import Encoder
@@ -481,7 +481,7 @@ READERS = {
     "depth_weights": Reader(_write_depth_weights, _read_depth_weights),
     "onnx": Reader(
         lambda folder: (folder / "a.onnx").write_bytes(onnx_of(dict.fromkeys("ab", np.ones((2, 3), np.float32)))),
-        lambda folder, what: read_onnx((folder / "a.onnx").read_bytes()),
+        lambda folder, what: read_onnx(read_file(folder / "a.onnx", 10**6)),
     ),
     "weights": Reader(_write_weights, _read_weights),
     "predictions": Reader(partial(_write_predictions, video=False), _read_predictions, (), "predicted"),
