@@ -38,7 +38,7 @@ RINGS = {
     "workshop": """
         data evaluate.perceptual planning
         evaluate.metrics
-        compat
+        baselines compat
         train
         viewer
         synth

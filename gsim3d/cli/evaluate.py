@@ -43,6 +43,7 @@ examples:
   gsim3d evaluate runs/model runs/data --metrics psnr psnr_masked ssim lpips_vgg
   gsim3d evaluate runs/model runs/data --predictions video=runs/video_model
   gsim3d evaluate --predictions runs/video_model runs/data --given 4
+  gsim3d evaluate elastic-small data/elastic --baselines spring-gaus spring-gaus-all --device cuda
   gsim3d evaluate runs/a/metrics.json --against runs/b/metrics.json
   torchrun --nproc-per-node 4 -m gsim3d evaluate runs/model runs/data --device cuda
 """
@@ -51,7 +52,10 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Scores the predictions of a simulator on the scenes of a data set."
     parser.epilog = EPILOG
-    add, checkpoint = parser.add_argument, f"{CHECKPOINT_HELP} (without it, only --predictions are scored)"
+    add, checkpoint = (
+        parser.add_argument,
+        f"{CHECKPOINT_HELP} (without it, --predictions and --baselines alone)",
+    )
     cameras = {"type": whole(0), "nargs": "+", "metavar": "CAM"}
     add("checkpoint", metavar="CHECKPOINT", nargs="?", help=checkpoint)
     add("data", metavar="DATA", help="folder with scenes, or scene folder; or a report to compare with --against")
@@ -61,6 +65,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         help="predictions of another model to score; may be repeated",
+    )
+    add(
+        "--baselines",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="methods that are fitted to each scene: spring-gaus (to 24 frames), spring-gaus-given (to the input "
+        "frames), spring-gaus-all (to the whole scene, as published); minutes a scene on a GPU, hours on a CPU",
     )
     add("--given", type=whole(1), metavar="N", help="number of input steps of the other models (without CHECKPOINT)")
     add(

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from gsim3d.baselines import baseline
 from gsim3d.data import Scene, find_scenes, published_split, split_scenes
 from gsim3d.errors import InputError
 from gsim3d.evaluate import compare
@@ -31,6 +32,7 @@ class Job:
         data: folder with scenes, or a report to compare.
         checkpoint: see :func:`gsim3d.train.restore.restore`; None scores only ``predictions``.
         predictions: "[NAME=]DIR" of other models.
+        baselines: names of :data:`gsim3d.baselines.BASELINES`, fitted to each scene.
         given: number of input steps of the other models, if there is no checkpoint.
         scenes: "test", "train" or "all"; None means "all" for held-out data sets, else "test".
         split: "gsim3d" or "published", the rule that holds scenes out.
@@ -48,6 +50,7 @@ class Job:
     data: str
     checkpoint: str | None = None
     predictions: Sequence[str] = ()
+    baselines: Sequence[str] = ()
     given: int | None = None
     scenes: str | None = None
     split: str = "gsim3d"
@@ -70,13 +73,13 @@ def evaluate(job: Job) -> None:
         InputError: options contradict each other, or the data do not fit the model.
     """
     other = None if job.against is None else compare.read_report(job.against)
-    if other is not None and job.checkpoint is None and not job.predictions:
+    if other is not None and job.checkpoint is None and not (job.predictions or job.baselines):
         comparison = compare.compare(compare.read_report(job.data), other, job.against)
         print(compare.table(comparison, job.against))
         return
     metrics, not_measured = measurable(job.metrics)
-    if job.checkpoint is None and not job.predictions:
-        raise InputError("nothing to evaluate: give a CHECKPOINT, or predictions of other models with --predictions")
+    if job.checkpoint is None and not (job.predictions or job.baselines):
+        raise InputError("nothing to evaluate: give a CHECKPOINT, --predictions of other models, or --baselines")
     if job.checkpoint is None and (job.given is None or job.given < 1):
         raise InputError("--given: the number of input steps (at least 1) is required without a CHECKPOINT")
     if job.checkpoint is not None and job.given is not None:
@@ -90,21 +93,30 @@ def evaluate(job: Job) -> None:
 def _evaluate(job: Job, metrics: tuple, not_measured: dict, against: dict | None, processes: Processes) -> None:
     """Scores this process's share of the scenes; the first process writes the report."""
     restored = None if job.checkpoint is None else restore(job.checkpoint, job.device)
-    others = [Predictions.open(given, job.data) for given in job.predictions]
+    fitted = [baseline(name, job.device) for name in job.baselines]
+    others = [*(Predictions.open(given, job.data) for given in job.predictions), *fitted]
     if len({other.name for other in others}) != len(others):
         raise InputError("--predictions: names must be unique; use NAME=DIR")
     out = _report_path(job, others)
     n_encoded = job.given if restored is None else restored.data.history
     scenes, conditions = _open_scenes(job, restored)
     views, n_future = _views(job, restored, others, scenes, n_encoded)
+    not_applicable = {}
     for scene, (_, targets) in zip(scenes, views):
         for other in others:
-            other.check(scene, targets, n_encoded, n_future)
+            try:
+                other.check(scene, targets, n_encoded, n_future)
+            except InputError as error:
+                if other not in fitted:
+                    raise
+                not_applicable.setdefault(other.name, str(error))
+    others = [other for other in others if other.name not in not_applicable]
     names = [_name(scene, job.data) for scene in scenes]
     conditions |= {
         "checkpoint": None if restored is None else restored.checkpoint.digest,
         "effects": None if restored is None else restored.plan.spec.hash,
         "predictions": {other.name: str(other.folder) for other in others},
+        "not_applicable": not_applicable,
         "data": str(job.data),
         "split": job.split,
         "fps": sorted({scene.fps for scene in scenes}),
@@ -122,7 +134,7 @@ def _evaluate(job: Job, metrics: tuple, not_measured: dict, against: dict | None
         return
     scores = [replace(score, scene=name) for score, name in zip(scores, names, strict=True)]
     summary = {**conditions, **summarize(scores, not_measured)}
-    print(table(summary))
+    print("\n".join([table(summary), *not_applicable.values()]))
     refused = None
     if against is not None:
         try:
@@ -140,7 +152,7 @@ def _evaluate(job: Job, metrics: tuple, not_measured: dict, against: dict | None
 def _report_path(job: Job, others: list[Predictions]) -> Path:
     if job.out:
         return output_path(job.out, ".json")
-    place = folder_of(job.checkpoint) if job.checkpoint else Path(others[0].folder)
+    place = folder_of(job.checkpoint) if job.checkpoint else Path(others[0].folder if job.predictions else "")
     if place.is_relative_to(FOLDER):  # the installed package is not written to
         return Path("metrics.json")
     return place / "metrics.json"

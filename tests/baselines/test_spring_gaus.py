@@ -1,0 +1,86 @@
+"""Spring-Gaus fitted to generated scenes, as ``gsim3d evaluate`` does."""
+
+import dataclasses
+import json
+
+import pytest
+import torch
+
+from gsim3d import baselines
+from gsim3d.baselines import SpringGausConfig, baseline, spring_gaus
+from gsim3d.data import Scene, find_scenes
+from gsim3d.errors import InputError
+from gsim3d.evaluate.job import Job, evaluate
+from gsim3d.synth import generate
+
+TARGETS = [2, 4, 6, 7, 8, 10, 11]
+QUICK = SpringGausConfig(
+    fit_frames=4, anchors=64, neighbors=8, edge=0.05, substeps=5, more_substeps=5, static_iterations=24,
+    refine_iterations=2, velocity_iterations=2, dynamic_iterations=2,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("elastic")
+    given = {"world": "elastic", "preset": "mini", "n_trajectories": 1, "seed": 77}
+    generate(str(folder), **given, processes=1, progress=False)
+    return folder
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    monkeypatch.setattr(spring_gaus, "FINE", 12)
+    monkeypatch.setattr(spring_gaus, "GROUND", 20)
+    for name, config in baselines.BASELINES.items():
+        few = {
+            "fit_frames": config.fit_frames and QUICK.fit_frames,
+            "dynamic_iterations": min(config.dynamic_iterations, 3),
+        }
+        monkeypatch.setitem(baselines.BASELINES, name, dataclasses.replace(QUICK, **few))
+
+
+def test_a_fit_falls_as_the_body_does(data, quick):
+    scene = Scene.open(find_scenes(data)[0])
+    cams = [cam for cam in range(scene.n_cams) if cam in (0, 3, 5, 9)]
+    made = [spring_gaus.Fit(scene, cams, 4, QUICK, torch.device("cpu")) for _ in range(2)]
+    images = [fit.images([2], range(8)) for fit in made]
+    assert torch.equal(*images)
+    truth = scene.images([2], range(8)).permute(0, 1, 3, 4, 2) / 255
+    errors = (images[0] - truth).square().mean((1, 2, 3, 4))
+    held = (images[0][:1] - truth).square().mean((1, 2, 3, 4))
+    assert errors[0] < 0.01 and errors[7] < held[7]
+    assert made[0].losses[-1] < 0.05 and made[0].velocity.abs().max() > 0
+
+
+def test_evaluate_scores_baselines_without_a_checkpoint(data, quick, tmp_path):
+    out = tmp_path / "metrics.json"
+    evaluate(Job(data=str(data), baselines=["spring-gaus"], given=4, steps=4, cameras=TARGETS, scenes="all", out=str(out),
+                 metrics=["psnr", "psnr_body"]))  # fmt: skip
+    report = json.loads(out.read_text())
+    assert report["not_applicable"] == {} and "spring-gaus" in report["predictions"]
+    assert report["spring-gaus.future.psnr"] > 18
+
+
+def test_where_it_does_not_apply_it_says_why(data, quick, tmp_path, monkeypatch, capsys):
+    with pytest.raises(InputError, match="choose from spring-gaus"):
+        baseline("springs")
+    scene, method = Scene.open(find_scenes(data)[0]), baseline("spring-gaus")
+    with pytest.raises(InputError, match="0 cameras are left"):
+        method.check(scene, list(range(scene.n_cams)), 4, 4)
+    monkeypatch.setattr(spring_gaus, "_count_bodies", lambda inside: 2)
+    with pytest.raises(InputError, match="2 bodies, and it simulates one"):
+        method.check(scene, [2], 4, 4)
+    out = tmp_path / "metrics.json"
+    job = Job(data=str(data), baselines=["spring-gaus"], given=4, steps=4, cameras=TARGETS, scenes="all", out=str(out))
+    evaluate(job)
+    assert "2 bodies" in json.loads(out.read_text())["not_applicable"]["spring-gaus"]
+    assert "2 bodies" in capsys.readouterr().out
+
+
+def test_bodies_are_counted():
+    inside = torch.zeros(20, 20, 20, dtype=torch.bool)
+    inside[2:6, 2:6, 2:6] = inside[12:16, 12:16, 12:16] = True
+    assert spring_gaus._count_bodies(inside) == 2
+    inside[6:12, 5, 5] = inside[11, 5:12, 5] = inside[11, 11, 5:12] = inside[11:13, 11:13, 11:13] = True
+    assert spring_gaus._count_bodies(inside) == 1
