@@ -55,8 +55,8 @@ def test_a_fit_falls_as_the_body_does(data, quick):
 
 def test_evaluate_scores_baselines_without_a_checkpoint(data, quick, tmp_path):
     out = tmp_path / "metrics.json"
-    evaluate(Job(data=str(data), baselines=["spring-gaus"], given=4, steps=4, cameras=TARGETS, scenes="all", out=str(out),
-                 metrics=["psnr", "psnr_body"]))  # fmt: skip
+    given = {"given": 4, "steps": 4, "cameras": TARGETS, "scenes": "all", "metrics": ["psnr", "psnr_body"]}
+    evaluate(Job(data=str(data), baselines=["spring-gaus"], out=str(out), **given))
     report = json.loads(out.read_text())
     assert report["not_applicable"] == {} and "spring-gaus" in report["predictions"]
     assert report["spring-gaus.future.psnr"] > 18
