@@ -18,63 +18,63 @@ MIN_DIFFERENCE = 18.0  # ... and its minimum, of 255
 BLUR = 1.2  # pixels, sigma of the Gaussian that suppresses noise and JPEG blocks
 CLOSE_SHARE = 0.012  # radius of the morphological closing, as a fraction of the image height
 MIN_AREA = 0.001  # fraction of the image; smaller components are removed
-OUTLINE = 2  # pixels on either side of the border of a component
-OUTLINE_FACTOR = 1.5  # by which the background's gradient exceeds the image's along the outline of a ghost
+FREQUENT = 3  # colours of a pixel that may be its background
+MIN_SHARE = 0.05  # of the steps, of a frequent colour
+INPAINT_RADIUS = 5  # pixels
+FREQUENCY_BONUS = 120  # difference of colours, of 255, that outweighs being in all steps rather than in none
 MAX_HOLE = 0.005  # fraction of the image; smaller holes are filled
 
 
 def background_image(read: Callable[[Sequence[int]], np.ndarray], n_steps: int) -> np.ndarray:
     """Estimates the background, uint8 [h, w, 3], of a static camera from at most BACKGROUND_STEPS steps.
 
-    It is the most frequent colour of each pixel: a body that moves before it changes its shading. A body that rests
-    longest at its place is part of it, and leaves a ghost where it was: there the background has the outline of a
-    body and the image has none. Such pixels become the median of the images that show the ghost.
+    It is the most frequent colour of each pixel, because a body that moves changes its shading. Where a body rests it
+    may be the most frequent colour, and leave a ghost where it was: of several frequent colours, the background has the
+    one most like the surroundings, weighed against its frequency.
 
     Args:
         read: function steps -> uint8 [S, h, w, 3].
         n_steps: number of steps recorded.
     """
-    frames = read(evenly_spaced(n_steps, BACKGROUND_STEPS))
-    blocks = np.split(frames, range(ROWS, frames.shape[1], ROWS), axis=1)
-    background = np.concatenate([_most_frequent(rows) for rows in blocks])
-    uncovered = np.stack([_ghosts(frame, background) for frame in frames])
-    for y, x in np.argwhere(uncovered.any(0)):
-        seen = frames[uncovered[:, y, x], y, x]
-        background[y, x] = np.partition(seen, len(seen) // 2, axis=0)[len(seen) // 2]
-    return background
-
-
-def _most_frequent(frames: np.ndarray) -> np.ndarray:
-    """Returns the mean [h, w, 3] of the largest set of values of a pixel around one of them, uint8 [S, h, w, 3]."""
-    best = np.zeros(frames.shape[1:3], np.int32)
-    result = frames[0].copy()
-    for frame in frames[:: -(-len(frames) // CANDIDATES)]:
-        near = (np.maximum(frames, frame) - np.minimum(frames, frame)).max(-1) <= SAME_COLOR
-        count = near.sum(0)
-        mean = (frames * near[..., None].astype(np.uint16)).sum(0) / count[..., None]
-        result = np.where((count > best)[..., None], np.rint(mean).astype(np.uint8), result)
-        best = np.maximum(best, count)
-    return result
-
-
-def _ghosts(image: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """Returns bool [h, w]: components of the foreground whose outline is in ``background``, not in ``image``."""
     import cv2
 
-    mask = foreground(image, background).astype(np.uint8)
-    edges = []
-    for picture in (image, background):
-        grey = cv2.GaussianBlur(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (0, 0), BLUR).astype(np.float32)
-        edges.append(np.hypot(cv2.Sobel(grey, -1, 1, 0), cv2.Sobel(grey, -1, 0, 1)))
-    n_parts, parts = cv2.connectedComponents(mask, connectivity=8)
-    wide = np.ones((2 * OUTLINE + 1,) * 2, np.uint8)
-    outline = np.where(cv2.dilate(mask, wide) > cv2.erode(mask, wide), 1, 0).astype(np.uint8)
-    nearest = cv2.dilate(parts.astype(np.float32), wide).astype(int)
-    ghosts = np.zeros(n_parts, bool)
-    for part in range(1, n_parts):
-        on = (nearest == part) & (outline > 0)
-        ghosts[part] = on.any() and edges[1][on].mean() > OUTLINE_FACTOR * edges[0][on].mean()
-    return ghosts[parts]
+    frames = read(evenly_spaced(n_steps, BACKGROUND_STEPS))
+    blocks = [_frequent(rows) for rows in np.split(frames, range(ROWS, frames.shape[1], ROWS), axis=1)]
+    colors, shares = (np.concatenate(parts, 1) for parts in zip(*blocks, strict=True))
+    uncertain = cv2.dilate((shares[1] >= MIN_SHARE).astype(np.uint8), np.ones((5, 5), np.uint8))
+    expected = cv2.inpaint(colors[0], uncertain, INPAINT_RADIUS, cv2.INPAINT_TELEA)
+    unlike = np.abs(colors.astype(np.int16) - expected).max(-1) - FREQUENCY_BONUS * shares
+    unlike[1:][shares[1:] < MIN_SHARE] = 255
+    best = np.where(uncertain, unlike.argmin(0), 0)
+    return np.take_along_axis(colors, best[None, ..., None], 0)[0]
+
+
+def _frequent(frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the most frequent colours of each pixel, uint8 [FREQUENT, h, w, 3], and their shares [FREQUENT, h, w].
+
+    A colour is the mean of the largest set of values of a pixel around one of them.
+
+    Args:
+        frames: uint8 [S, h, w, 3].
+    """
+    left, colors, shares = np.ones(frames.shape[:3], bool), [], []
+    for _ in range(FREQUENT):
+        best, members = np.zeros(frames.shape[1:3], np.int32), np.zeros_like(left)
+        for frame in frames[:: -(-len(frames) // CANDIDATES)]:
+            near = left & (_difference(frames, frame) <= SAME_COLOR)
+            count = near.sum(0)
+            members = np.where(count > best, near, members)
+            best = np.maximum(best, count)
+        mean = (frames * members[..., None].astype(np.uint16)).sum(0) / np.maximum(best, 1)[..., None]
+        colors.append(np.rint(mean).astype(np.uint8))
+        shares.append(best / len(frames))
+        left &= _difference(frames, colors[-1]) > 2 * SAME_COLOR  # values just outside of the set are the same colour
+    return np.stack(colors), np.stack(shares)
+
+
+def _difference(frames: np.ndarray, color: np.ndarray) -> np.ndarray:
+    """Returns the largest difference [S, h, w] of a channel."""
+    return (np.maximum(frames, color) - np.minimum(frames, color)).max(-1)
 
 
 def foreground(image: np.ndarray, background: np.ndarray) -> np.ndarray:

@@ -144,8 +144,8 @@ class LossConfig:
         body_weight: weight added to pixels of movable bodies; other pixels have weight 1.
         perceptual: weight of LPIPS (VGG), added to the squared error; 0.05 in the paper, 0.01 for its rigid bodies.
             Install its weights with `gsim3d weights lpips`.
-        image_gain: multiply the colour channels of each predicted image by the gains from 2/3 to 3/2 that fit its
-            target best, for cameras that differ in exposure or white balance.
+        image_gain: multiply the colour channels of each predicted image by the gains (2/3 to 3/2) that fit its target
+            best, relative to the mean gain of the batch, for cameras that differ in exposure or white balance.
     """
 
     balance: float = 0.5

@@ -30,7 +30,7 @@ def training_loss(
     if targets.valid is not None:
         weight = targets.valid.float() if weight is None else weight * targets.valid
     if settings.image_gain:
-        images = images * fitted_gain(images.detach(), truth, weight)
+        images = images * relative_gains(images.detach(), truth, weight)
     step = targets.cameras.image_cloud % n_steps
     wrong = image_errors(images, truth, weight)
     if perceptual is not None:
@@ -66,12 +66,17 @@ def image_errors(pred: Tensor, target: Tensor, weight: Tensor | None = None) -> 
     return (errors * weight).sum((1, 2)) / weight.sum((1, 2)).clamp(min=LEAST_WEIGHT)
 
 
-def fitted_gain(pred: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
-    """Returns the gains [I, 1, 1, C] of images [I, H, W, C], from 1 / MAX_GAIN to MAX_GAIN, with the least error."""
+def relative_gains(pred: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
+    """Returns the gains [I, 1, 1, C] of images [I, H, W, C] with the least error, relative to their mean.
+
+    Gains lie between 1 / MAX_GAIN and MAX_GAIN. Without the division by their geometric mean over the images, a model
+    would not learn how bright a scene is.
+    """
     weight = 1 if weight is None else weight[..., None]
     power = (weight * pred * pred).sum((1, 2), keepdim=True)
     gain = (weight * pred * target).sum((1, 2), keepdim=True) / power.clamp(min=LEAST_WEIGHT)
-    return torch.where(power > 0, gain, 1).clamp(1 / MAX_GAIN, MAX_GAIN)
+    gain = torch.where(power > 0, gain, 1).clamp(1 / MAX_GAIN, MAX_GAIN).log()
+    return (gain - gain.mean(0)).exp()
 
 
 def mean_by_step(values: Tensor, step: Tensor, n_steps: int) -> Tensor:

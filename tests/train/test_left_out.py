@@ -15,7 +15,7 @@ from gsim3d.train.captured import CapturedLoss
 from gsim3d.train.config import DataConfig, LossConfig, PhaseConfig, TrainConfig
 from gsim3d.train.left_out import draw_left_out, images_per_cloud, with_views
 from gsim3d.train.loop import Trainer
-from gsim3d.train.losses import fitted_gain, training_loss
+from gsim3d.train.losses import relative_gains, training_loss
 from gsim3d.train.restore import restore
 from gsim3d.train.run import train
 from tests.tiny_scenes import write_scene
@@ -91,17 +91,19 @@ def test_captured_loss_leaves_out_the_same_particles(trainer):
             assert (known[id(parameter)] - gradient).norm() < 0.02 * gradient.norm()
 
 
-def test_gain_of_an_image_is_fitted_within_limits(trainer):
+def test_gains_of_images_are_fitted_relative_to_their_mean(trainer):
     pred = torch.rand(3, 8, 8, 3, generator=torch.Generator().manual_seed(0))
     gains = torch.tensor([[1.2, 0.8, 1.0], [3.0, 0.1, 1.0], [1.0, 1.0, 1.0]])[:, None, None]
-    found = fitted_gain(pred, pred * gains)
-    torch.testing.assert_close(found, gains.clamp(1 / 1.5, 1.5))
-    targets = trainer._batch([0]).targets
-    images, weights = targets.images.permute(0, 2, 3, 1) * 0.8, torch.ones(3)
-    plain, _ = training_loss(LossConfig(), None, images, targets, weights)
-    gained, _ = training_loss(LossConfig(image_gain=True), None, images, targets, weights)
-    assert gained < 1e-9 < plain
-    assert (fitted_gain(torch.zeros(1, 2, 2, 3), torch.ones(1, 2, 2, 3)) == 1).all()
+    limited = gains.clamp(1 / 1.5, 1.5)
+    torch.testing.assert_close(relative_gains(pred, pred * gains), limited / limited.log().mean(0).exp())
+    assert (relative_gains(torch.zeros(2, 2, 2, 3), torch.ones(2, 2, 2, 3)) == 1).all()
+    targets, weights = trainer._batch([0]).targets, torch.ones(3)
+    truth = targets.images.permute(0, 2, 3, 1)
+    exposure = torch.tensor([0.8, 1.0, 1.25]).repeat(3)[:, None, None, None]  # of the three cameras at each step
+    for images, forgiven in ((truth * exposure, True), (truth * 0.8, False)):
+        plain, _ = training_loss(LossConfig(), None, images, targets, weights)
+        gained, _ = training_loss(LossConfig(image_gain=True), None, images, targets, weights)
+        assert gained < 1e-6 * plain if forgiven else torch.isclose(gained, plain, rtol=1e-3)
 
 
 def test_run_trains_at_the_subsampled_rate_and_its_model_asks_for_it(tmp_path):
