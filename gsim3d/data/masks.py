@@ -39,42 +39,48 @@ def background_image(read: Callable[[Sequence[int]], np.ndarray], n_steps: int) 
     import cv2
 
     frames = read(evenly_spaced(n_steps, BACKGROUND_STEPS))
-    blocks = [_frequent(rows) for rows in np.split(frames, range(ROWS, frames.shape[1], ROWS), axis=1)]
-    colors, shares = (np.concatenate(parts, 1) for parts in zip(*blocks, strict=True))
-    uncertain = cv2.dilate((shares[1] >= MIN_SHARE).astype(np.uint8), np.ones((5, 5), np.uint8))
+    n, shape = len(frames), frames.shape[1:3]
+    blocks = [_frequent(rows.reshape(n, -1, 3)) for rows in np.split(frames, range(ROWS, shape[0], ROWS), axis=1)]
+    colors, shares = (np.concatenate(parts, 1).reshape(FREQUENT, *shape, -1) for parts in zip(*blocks, strict=True))
+    uncertain = cv2.dilate((shares[1, ..., 0] > 0).astype(np.uint8), np.ones((5, 5), np.uint8))
     expected = cv2.inpaint(colors[0], uncertain, INPAINT_RADIUS, cv2.INPAINT_TELEA)
-    unlike = np.abs(colors.astype(np.int16) - expected).max(-1) - FREQUENCY_BONUS * shares
-    unlike[1:][shares[1:] < MIN_SHARE] = 255
-    best = np.where(uncertain, unlike.argmin(0), 0)
-    return np.take_along_axis(colors, best[None, ..., None], 0)[0]
+    unlike = np.abs(colors.astype(np.int16) - expected).max(-1, keepdims=True) - FREQUENCY_BONUS * shares
+    unlike[shares == 0] = np.inf
+    return np.take_along_axis(colors, unlike.argmin(0)[None], 0)[0]
 
 
 def _frequent(frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the most frequent colours of each pixel, uint8 [FREQUENT, h, w, 3], and their shares [FREQUENT, h, w].
+    """Returns the most frequent colours of each pixel, uint8 [FREQUENT, n, 3], and their shares [FREQUENT, n].
 
-    A colour is the mean of the largest set of values of a pixel around one of them.
+    A colour is the mean of the largest set of values of a pixel around one of them. Shares below MIN_SHARE are 0,
+    except the first.
 
     Args:
-        frames: uint8 [S, h, w, 3].
+        frames: uint8 [S, n, 3].
     """
-    left, colors, shares = np.ones(frames.shape[:3], bool), [], []
-    for _ in range(FREQUENT):
-        best, members = np.zeros(frames.shape[1:3], np.int32), np.zeros_like(left)
+    colors, shares = np.zeros((FREQUENT, *frames.shape[1:]), np.uint8), np.zeros((FREQUENT, frames.shape[1]))
+    at, left = np.arange(frames.shape[1]), np.ones(frames.shape[:2], bool)  # pixels, and values without a colour
+    for number in range(FREQUENT):
+        best, members = np.zeros(len(at), np.int32), np.zeros_like(left)
         for frame in frames[:: -(-len(frames) // CANDIDATES)]:
             near = left & (_difference(frames, frame) <= SAME_COLOR)
             count = near.sum(0)
             members = np.where(count > best, near, members)
             best = np.maximum(best, count)
-        mean = (frames * members[..., None].astype(np.uint16)).sum(0) / np.maximum(best, 1)[..., None]
-        colors.append(np.rint(mean).astype(np.uint8))
-        shares.append(best / len(frames))
-        left &= _difference(frames, colors[-1]) > 2 * SAME_COLOR  # values just outside of the set are the same colour
-    return np.stack(colors), np.stack(shares)
+        mean = (frames * members[..., None].astype(np.uint16)).sum(0) / np.maximum(best, 1)[:, None]
+        color, share = np.rint(mean).astype(np.uint8), best / len(frames)
+        found = (share >= MIN_SHARE) | (number == 0)
+        colors[number, at[found]], shares[number, at[found]] = color[found], share[found]
+        left &= _difference(frames, color) > 2 * SAME_COLOR  # values just outside of the set are the same colour
+        rest = left.mean(0) >= MIN_SHARE
+        at, left, frames = at[rest], left[:, rest], frames[:, rest]
+    return colors, shares
 
 
 def _difference(frames: np.ndarray, color: np.ndarray) -> np.ndarray:
-    """Returns the largest difference [S, h, w] of a channel."""
-    return (np.maximum(frames, color) - np.minimum(frames, color)).max(-1)
+    """Returns the largest difference [S, n] of a channel."""
+    apart = np.maximum(frames, color) - np.minimum(frames, color)
+    return np.maximum(np.maximum(apart[..., 0], apart[..., 1]), apart[..., 2])  # faster than a maximum of 3 elements
 
 
 def foreground(image: np.ndarray, background: np.ndarray) -> np.ndarray:
