@@ -31,6 +31,7 @@ from gsim3d.data.recording import BACKGROUND
 from gsim3d.dynamics import RestLog, concatenate
 from gsim3d.effects.edits import Edit
 from gsim3d.errors import FitWarning, InputError, NumericalError
+from gsim3d.evaluate.physics import measure_particles, measure_truth, true_states
 from gsim3d.evaluate.predictions import Predictions
 from gsim3d.evaluate.scoring import EXACT_PARTS, PLAIN_METRICS, SceneScores, SceneTruth
 from gsim3d.io.terminal import progress
@@ -307,6 +308,8 @@ def score_scene(
     valid = None if valid is None else valid.to(device)
     truth = SceneTruth(scene.name, images, labels, valid, n_encoded, metrics)
 
+    physics: dict[str, dict[str, Tensor]] = {}
+
     def predicted() -> Iterator[tuple[str, Tensor]]:
         baselines: dict[str, Callable[[], Tensor]] = {
             "copy": lambda: images[n_encoded - 1].expand(n_future, *images.shape[1:])
@@ -314,6 +317,7 @@ def score_scene(
         if restored is not None:
             made = prediction or predict(restored, scene, context_cams, n_future, start)
             rendered = render_steps(restored, made.particles, scene, cams, start)
+            physics.update(_physics(scene, made, range(n_given - 1, n_given + n_future)))
             yield "model", rendered
             baselines = {
                 "constant": lambda: _held(restored, made, rendered, n_encoded - 1, scene, cams, start),
@@ -328,7 +332,21 @@ def score_scene(
             yield other.name, theirs
         yield from ((name, make()) for name, make in baselines.items() if name in methods)
 
-    return dataclasses.replace(truth.score(predicted()), digest=digest)
+    return dataclasses.replace(truth.score(predicted()), digest=digest, physics=physics)
+
+
+def _physics(scene: Scene, prediction: Prediction, steps: range) -> dict[str, dict[str, Tensor]]:
+    """Physical measures of the predicted particles and of the truth; ``steps`` begin with the last given one."""
+    states, last = true_states(scene), prediction.n_encoded - 1
+    if states is not None and min(len(nodes) for nodes in states) < steps.stop:
+        states = None
+    nodes = None if states is None else [body[steps.start] for body in states]
+    held = concatenate([prediction.step(last), constant_velocity(prediction)])
+    found = {
+        "model": measure_particles(prediction.particles, scene, last, nodes),
+        "constant_velocity": measure_particles(held, scene, 0, nodes),
+    }
+    return found if states is None else {**found, "truth": measure_truth(states, scene, steps)}
 
 
 def score_scenes(

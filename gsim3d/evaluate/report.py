@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gsim3d.evaluate.metrics import mean_of_counted
 from gsim3d.evaluate.perceptual.fvd import MIN_CLIPS, TREND_CLIPS, frechet_distance
+from gsim3d.evaluate.physics import MEASURES
 from gsim3d.evaluate.scoring import METRICS, RING_WIDTH, SceneScores
 from gsim3d.io.files import write_whole
 from gsim3d.synth.held_out import describe_set
@@ -36,6 +37,8 @@ def summarize(scores: Sequence[SceneScores], not_measured: dict[str, str] | None
     - ``future.fvd``: distance between all predicted and all true clips.
     - ``body_share``: fraction of the foreground covered by bodies.
     - ``added_mse.R``: mean squared error in region R, predicted steps minus input steps.
+    - ``physics``: method or "truth" -> measure of :mod:`gsim3d.evaluate.physics` -> mean over scenes for each predicted
+      step.
     - ``by_step``, ``by_step_std``: mean over scenes and deviation between scenes, for each step.
     - ``not_measured``: metric -> reason.
 
@@ -83,11 +86,37 @@ def summarize(scores: Sequence[SceneScores], not_measured: dict[str, str] | None
             result[key] = statistics.fmean(known)
     if any(s.clips for s in scores) and "fvd" not in missing:
         _add_fvd(result, missing, scores)
+    result["physics"] = _mean_physics(scores, n_steps - n_encoded)
     result["not_measured"] = missing
     result["by_step"] = by_step
     result["by_step_std"] = by_step_std
     result["scenes"] = scenes
     return result
+
+
+def _mean_physics(scores: Sequence[SceneScores], n_future: int) -> dict:
+    """Means over scenes of what all scenes have."""
+    found: dict = {}
+    for method in ("truth", "model", "constant_velocity"):
+        known = [s.physics.get(method) for s in scores]
+        if known and all(known):
+            found[method] = {m: _numbers(torch.stack([k[m][:n_future] for k in known]).mean(0)) for m in MEASURES}
+    return found
+
+
+def physics_table(summary: dict) -> list[str]:
+    """Formats the physical measures at the first, middle and last predicted step, with formulas; empty without them."""
+    if not summary.get("physics"):
+        return []
+    n_future = summary["n_future_steps"]
+    steps = sorted({0, n_future // 2, n_future - 1})
+    head = ["Physics", "Method", *(f"step {summary['n_encoded_steps'] + step}" for step in steps)]
+    lines = ["", _row(head), _row(["---"] * len(head))]
+    for name, measure in MEASURES.items():
+        for method, values in summary["physics"].items():
+            lines.append(_row([measure.label, method, *(f"{values[name][step]:.{measure.digits}f}" for step in steps)]))
+    formulas = "; ".join(f"{name}: {measure.formula}" for name, measure in MEASURES.items())
+    return [*lines, "", f"Per unit mass, points weighted equally, v from one step to the next: {formulas}."]
 
 
 def _add_fvd(result: dict, missing: dict, scores: Sequence[SceneScores]) -> None:
@@ -161,6 +190,7 @@ def markdown(summary: dict, dataset: str) -> str:
             key = f"{_prefix(method)}{part}"
             if any(f"{key}.{m}" in summary for m in by_step):
                 lines.append(_row([name, method, *(_number(summary.get(f"{key}.{m}"), m) for m in by_step)]))
+    lines += physics_table(summary)
     lines += ["", f"{summary['n_scenes']} scenes; {summary['n_encoded_steps']} steps given, "
               f"{summary['n_future_steps']} predicted. Mean over steps of the mean over scenes ± mean over steps of "
               f"the standard deviation between scenes. Of PSNR, {REGIONS}."]  # fmt: skip
@@ -214,6 +244,7 @@ def table(summary: dict) -> str:
         kind = "given" if step < summary["n_encoded_steps"] else "predicted"
         numbers = [_number(summary["by_step"][f"{_prefix(methods[0])}{m}"][step], m) for m in by_step]
         lines.append(f"{f'{step:4d} {kind}':34}" + "".join(f"{number:>13}" for number in numbers))
+    lines += physics_table(summary)
     extra = notes(summary)
     return "\n".join([*lines, *([""] if extra else []), *extra])
 

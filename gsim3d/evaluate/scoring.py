@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -67,6 +67,7 @@ class SceneScores:
         body_share: float64 [S], fraction of the foreground covered by bodies, mean over the target views; None without
             labels.
         digest: hash of the true images and labels.
+        physics: method (and ``"truth"``) -> measure of :mod:`gsim3d.evaluate.physics` -> float64 [S - n_encoded].
     """
 
     scene: str
@@ -77,6 +78,7 @@ class SceneScores:
     not_measured: dict[str, str]
     body_share: Tensor | None = None
     digest: str = ""
+    physics: dict[str, dict[str, Tensor]] = field(default_factory=dict)
 
 
 def ring_around_bodies(labels: Tensor) -> Tensor:
