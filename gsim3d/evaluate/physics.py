@@ -120,7 +120,7 @@ def measure_truth(states: Sequence[Tensor], scene: Scene, steps: range) -> dict[
 
 
 def true_states(scene: Scene) -> list[Tensor] | None:
-    """Returns the nodes [T, N, 3] of each body and cloth that the generator wrote; None if the scene has no ``states.npz``.
+    """Returns the nodes [T, N, 3] of each body and cloth as generated; None if the scene has no ``states.npz``.
 
     Raises:
         InputError: the file is damaged, or does not fit the scene.
