@@ -28,8 +28,8 @@ from gsim3d.state import (
     with_same_attributes,
 )
 
-# Standard deviations of the initial weights. A point is one of hundreds of particles: moving one ball as prescribed, the
-# preset tiny did not learn from displacements in 3000 steps with 0.5, and did in 1000 with 2.5.
+# Standard deviations of the initial weights. A point is one of hundreds of particles: of a single ball that moves as
+# prescribed, the preset tiny learned nothing from displacements in 3000 steps with 0.5, and enough in 1000 with 2.5.
 EMBEDDING, DISPLACEMENT = 0.5, 2.5
 
 
