@@ -211,7 +211,7 @@ class _Run:
                 background_stride=proposal["body_stride"],
                 leave_one_out=True,
             ),
-            loss=LossConfig(image_gain=True),
+            loss=LossConfig(body_weight=2.0, image_gain=True),
             optimizer=OptimizerConfig(clip_norm=1.0, ema_decay=0.98),
             captured=device == "cuda",
         )
