@@ -67,6 +67,8 @@ def capture(
         InputError: films or cameras cannot be used; the message names angles or reprojection errors.
     """
     folder, out = Path(folder), Path(out)
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder")
     if out.exists() and not out.is_dir():
         raise InputError(f"--out: {out} is not a folder")
     out.mkdir(parents=True, exist_ok=True)
@@ -83,14 +85,8 @@ def capture(
 
 class _Run:
     def __init__(self, folder: Path, out: Path, device: str, minutes: float, force: bool, say: Callable[[str], None]):
-        self.folder, self.out, self.device, self.minutes, self.force, self.say = (
-            folder,
-            out,
-            device,
-            minutes,
-            force,
-            say,
-        )
+        self.folder, self.out, self.say = folder, out, say
+        self.device, self.minutes, self.force = device, minutes, force
 
     def step(self, name: str, compute: Callable[[], Any]) -> Any:
         """Returns the result of a step, read from its file if it exists, else computed and written."""
@@ -108,8 +104,6 @@ class _Run:
 
     def calibrate(self, board: Board | None, scale) -> None:
         """Writes cameras.json where films have none."""
-        if not self.folder.is_dir():
-            raise InputError(f"{self.folder} is not a folder")
         below = [path for path in self.folder.iterdir() if path.is_dir() and path.name != BOARD]
         filmed = [take for take in (self.folder, *below) if films_in(take)]
         if filmed and not all((take / FILE).is_file() for take in filmed):

@@ -54,6 +54,8 @@ def read_particles(path: str | Path) -> tuple[Particles, str]:
         tensors = load_file(path)
         version, model = about["version"], about["model"]
         actions = _actions(about, tensors)
+    except MemoryError:
+        raise InputError(f"{path}: {path.stat().st_size / 2**30:.1f} GiB do not fit into memory") from None
     except (safetensors.SafetensorError, OSError, ValueError, KeyError, TypeError, RecursionError):
         raise InputError(f"{path}: not a state, which gsim3d simulate writes as {STATE}, or a damaged one") from None
     if version != VERSION:
