@@ -205,11 +205,13 @@ class PrecisionConfig:
         encoder: precision of the encoder.
         dynamics: precision of the dynamics.
         renderer: precision of the renderer's head.
+        perceptual: precision of the convolutions of LPIPS in the loss.
     """
 
     encoder: Precision = "fp32"
     dynamics: Precision = "fp32"
     renderer: Precision = "fp32"
+    perceptual: Precision = "fp32"
 
     @property
     def scales_loss(self) -> bool:

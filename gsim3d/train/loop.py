@@ -103,7 +103,7 @@ class Trainer:
         check_settings(config, self.simulator.config.dynamics, self.plan, self.processes.count)
         if self.effects.dynamics.actions and not any(scene.has_actions() for scene in scenes):
             raise InputError("effects: dynamics.actions is on, but no scene has actions (actions.npz); leave it out")
-        perceptual = load("lpips_vgg", partial(LPIPS, "vgg")).to(device) if config.loss.perceptual else None
+        perceptual = self._perceptual() if config.loss.perceptual else None
         self.loss_of_images = partial(training_loss, config.loss, perceptual)
         self.parameters = dict(self.simulator.named_parameters())
         self.buffers = dict(self.simulator.named_buffers())
@@ -128,6 +128,16 @@ class Trainer:
         frozen = self.simulator.encoder.has_frozen_backbone
         self.features = FeatureCache(self.simulator.encoder, device) if frozen else None
         self.captured = self._capture() if config.captured and device == "cuda" else None
+
+    def _perceptual(self) -> Callable[[Tensor, Tensor], Tensor]:
+        """LPIPS in its precision."""
+        network = load("lpips_vgg", partial(LPIPS, "vgg")).to(self.device)
+
+        def distance(images: Tensor, truth: Tensor) -> Tensor:
+            with self.config.precision.of("perceptual", self.device):
+                return network(images, truth)
+
+        return distance
 
     def _capture(self) -> CapturedLoss:
         precision = partial(self.config.precision.of, device=self.device)

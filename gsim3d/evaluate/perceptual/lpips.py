@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from gsim3d.errors import InputError
 from gsim3d.evaluate.perceptual.colors import as_colors
 from gsim3d.evaluate.perceptual.weights import load
-from gsim3d.nn.layers import exact_convolutions
+from gsim3d.nn.layers import exact_convolutions, widened
 
 # Mean and deviation of the classifier's training images, for inputs in [-1, 1].
 SHIFT = (-0.030, -0.088, -0.188)
@@ -97,12 +97,21 @@ class LPIPS(nn.Module):
         x = ((2 * images - 1) - self.shift) / self.scale
         taps = []
         for layer, conv in zip(self.layers, self.convs):
-            if layer.pool:
+            if layer.pool == 2:
+                x = _halved(x)
+            elif layer.pool:
                 x = F.max_pool2d(x, layer.pool, 2)
             x = F.relu(conv(x))
             if layer.tap:
-                taps.append(x)
+                taps.append(widened(x))  # under autocast only convolutions are shorter
         return taps
+
+
+def _halved(x: Tensor) -> Tensor:
+    """Max pooling by 2, whose gradient needs no atomics."""
+    height, width = (size // 2 for size in x.shape[2:])
+    blocks = x[:, :, : 2 * height, : 2 * width].unflatten(3, (width, 2)).unflatten(2, (height, 2))
+    return blocks.amax((3, 5))
 
 
 def _unit(features: Tensor) -> Tensor:
