@@ -7,6 +7,7 @@ finite; ``types``, strings [A], the type of each point. Point a at step t is whe
 from __future__ import annotations
 
 import io
+import tokenize
 import zipfile
 import zlib
 from pathlib import Path
@@ -21,7 +22,7 @@ FILE = "actions.npz"
 MAX_BYTES = 256 * 2**20  # of the file, and of each array in it
 MAX_TYPE = 64  # characters of the name of a type
 UNREADABLE = (OSError, ValueError, KeyError, EOFError, MemoryError, NotImplementedError, RuntimeError, SyntaxError,
-              TypeError, zipfile.BadZipFile, zlib.error)  # fmt: skip
+              TypeError, tokenize.TokenError, zipfile.BadZipFile, zlib.error)  # fmt: skip
 
 
 def read_actions(folder: Path, n_steps: int, problems: Problems) -> RecordedActions | None:
@@ -53,7 +54,7 @@ def _arrays(content: bytes) -> tuple[np.ndarray, np.ndarray]:
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         if missing := {"positions", "types"}.difference(file.files):
             raise ValueError(f"the array {min(missing)} is missing")
-        return file["positions"], file["types"]
+        return np.asarray(file["positions"]), np.asarray(file["types"])  # a member without array header: bytes
 
 
 def _problem(positions: np.ndarray, types: np.ndarray, n_steps: int) -> str | None:

@@ -261,7 +261,7 @@ class _Sequence:
                 if max((entry.file_size for entry in archive.infolist()), default=0) > MAX_BYTES:
                     raise ValueError(f"an array has more than {MAX_BYTES} bytes")
             with np.load(content, allow_pickle=False) as arrays:
-                found = {key: arrays[key] for key in shapes}
+                found = {key: np.asarray(arrays[key]) for key in shapes}  # a member without array header: bytes
         except (InputError, *UNREADABLE) as error:
             problems.add(str(error) if isinstance(error, InputError) else f"{file} cannot be read: {str(error)[:200]}")
             return None

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.data import Scene
+from gsim3d.data.actions import UNREADABLE
 from gsim3d.errors import InputError
 from gsim3d.state import DYNAMIC, Particles
 
@@ -131,7 +132,7 @@ def true_states(scene: Scene) -> list[Tensor] | None:
     try:
         with np.load(file, allow_pickle=False) as states:
             found = [torch.from_numpy(states[name]) for name in states.files if name != "actors"]
-    except (OSError, ValueError, KeyError, TypeError, EOFError, NotImplementedError) as error:
+    except UNREADABLE as error:
         raise InputError(f"{file}: cannot be read: {error}") from None
     for nodes in found:
         if nodes.ndim < 3 or nodes.shape[-1] != 3 or not nodes.isfinite().all():

@@ -1,6 +1,8 @@
 """actions.npz: round trip, conversion with the scene, and refusal of damaged files."""
 
 import dataclasses
+import io
+import zipfile
 
 import numpy as np
 import pytest
@@ -123,4 +125,19 @@ def test_files_that_are_no_actions_are_refused(folder):
     assert refused > 150
     np.savez(folder / FILE, positions=POSITIONS)
     with pytest.raises(InputError, match="the array types is missing"):
+        Scene.open(folder)
+    with zipfile.ZipFile(folder / FILE, "w") as archive:
+        archive.writestr("positions.npy", b"no array")
+        archive.writestr("types.npy", b"no array")
+    with pytest.raises(InputError, match="positions must be float32"):
+        Scene.open(folder)
+
+
+def test_a_damaged_header_of_an_array_is_refused(folder):
+    header = io.BytesIO()
+    np.save(header, POSITIONS)
+    with zipfile.ZipFile(folder / FILE, "w") as archive:
+        archive.writestr("positions.npy", header.getvalue().replace(b"'descr': '<f4'", b"'descr': ('<f4"))
+        archive.writestr("types.npy", b"no array")
+    with pytest.raises(InputError, match="cannot be read"):
         Scene.open(folder)

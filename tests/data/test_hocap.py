@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import zipfile
 from pathlib import Path
 
 import cv2
@@ -195,6 +196,10 @@ def test_damaged_calibration_and_labels_are_refused_by_file(tmp_path):
     ):
         np.savez(tmp_path / "other.npz", **arrays | {key: value})
         refused(label, message, (tmp_path / "other.npz").read_bytes())
+    with zipfile.ZipFile(tmp_path / "raw.npz", "w") as archive:
+        for key in arrays:
+            archive.writestr(f"{key}.npy", b"no array")
+    refused(label, "must be finite numbers", (tmp_path / "raw.npz").read_bytes())
     (folder / SERIALS[1] / "color_000001.jpg").unlink()
     cv2.imwrite(str(folder / SERIALS[1] / "color_000002.jpg"), np.zeros((8, 8, 3), np.uint8))
     with pytest.raises(InputError, match="color_000001.jpg"):

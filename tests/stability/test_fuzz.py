@@ -122,6 +122,12 @@ def test_a_kept_input_can_be_run_again(misbehaved):
     assert answers == ["ok", "ok", "ok", "ValueError"]
 
 
+def test_a_child_that_cannot_start_is_no_failure_of_an_input(tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.executable", "/bin/false")
+    with pytest.raises(RuntimeError, match="ended with code 1 before it had an input"):
+        run(["_good"], 2, out=tmp_path)
+
+
 def test_a_campaign_goes_on_where_it_was(tmp_path, capsys):
     assert campaign(["_good"], 4, tmp_path, a_round=3) and not list(tmp_path.glob("_good-*"))
     assert not campaign(["_good", "_unnamed"], 6, tmp_path, a_round=6)

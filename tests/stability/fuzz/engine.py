@@ -260,7 +260,7 @@ def _child(
     code = "import json, sys; from pathlib import Path; from tests.stability.fuzz import engine; "
     code += "engine.work(json.loads(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3]), float(sys.argv[4]))"
     command = [sys.executable, "-c", code, json.dumps(jobs), str(seed), str(out), str(seconds)]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
     with open(out / "log", "wb") as log:
         child = subprocess.Popen(command, cwd=ROOT, env=environment, stderr=log, stdout=log)
     # The libraries take their time to load.
@@ -282,6 +282,8 @@ def _child(
     if number == len(jobs):
         return None, number, 0
     said = (out / "log").read_text(errors="replace").strip().splitlines()[-1:] or [""]
+    if child.returncode > 0 and not (out / "input").exists():
+        raise RuntimeError(f"the process ended with code {child.returncode} before it had an input: {said[0]}")
     if problem is None and child.returncode < 0:
         problem = f"the process was ended by {signal.Signals(-child.returncode).name}: {said[0][:200]}"
     return problem or f"the process ended with code {child.returncode}: {said[0][:200]}", number, index
