@@ -68,10 +68,6 @@ class TrueScene(ABC):
     def move(self, velocities: np.ndarray) -> None:
         """Simulates one frame, in which the actors have ``velocities`` [A, 3] in m/s."""
 
-    def throw(self, velocity: np.ndarray) -> None:
-        """Gives the body, which was held until now, a ``velocity`` [3] in m/s."""
-        raise NotImplementedError(f"{type(self).__name__} has nothing to throw")
-
     def view(self, rig: cameras.Rig) -> render.View:
         """Images of all cameras now."""
         if rig.size not in self._renderers:
@@ -94,9 +90,6 @@ class Scenes(Protocol):
 
     def move(self, velocities: Tensor) -> None:
         """Simulates one frame, in which the actors have ``velocities`` [n, A, 3] in m/s."""
-
-    def throw(self, velocities: Tensor) -> None:
-        """Gives the bodies, which were held until now, ``velocities`` [n, 3] in m/s."""
 
     def actors(self) -> Tensor:
         """Centers of the actors, float64 [n, A, 3] metres."""
@@ -134,10 +127,6 @@ class TrueScenes(Scenes):
     def move(self, velocities: Tensor) -> None:
         for scene, of_scene in zip(self.all, velocities.numpy(), strict=True):
             scene.move(of_scene)
-
-    def throw(self, velocities: Tensor) -> None:
-        for scene, velocity in zip(self.all, velocities.numpy(), strict=True):
-            scene.throw(velocity)
 
     def actors(self) -> Tensor:
         return torch.from_numpy(np.stack([scene.actors for scene in self.all]))

@@ -58,6 +58,7 @@ class TaskEnv(gymnasium.Env):
     max_bodies: ClassVar[int] = 1
     actors: ClassVar[tuple[str, tuple[int, ...]] | None] = None  # name and shape of their observed positions
     max_action: ClassVar[tuple[float, ...]]
+    true_scenes: ClassVar[type[TrueScenes]] = TrueScenes
     shipped: ClassVar[str] = ""  # name of the simulator that is the default of ``model``, once it ships
 
     def __init__(self, observation: str = "particles", image_size: int = 64, render_mode: str | None = None, **options):
@@ -167,7 +168,7 @@ class Episodes:
         elif model is not None or device != "cpu":
             raise InputError('model and device are of backend="model"; MuJoCo simulates the truth on the CPU')
         else:
-            self.scenes = TrueScenes(count, task.max_bodies)
+            self.scenes = task.true_scenes(count, task.max_bodies)
         self._high = torch.tensor(task.max_action, dtype=torch.float64, device=self.scenes.device)
         self.goals = torch.zeros(count, 2, dtype=torch.float64, device=self.scenes.device)
         self.action_space = spaces.Box(-self._high.float().cpu().numpy(), self._high.float().cpu().numpy())

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsim3d.envs.scenes import FPS, N_PARTICLES, Scenes, TrueScene, polar
+from gsim3d.envs.model import ModelScenes
+from gsim3d.envs.scenes import FPS, N_PARTICLES, Scenes, TrueScene, TrueScenes, polar
 from gsim3d.envs.tasks import TaskEnv, TaskVectorEnv
 from gsim3d.synth import pushing
 from gsim3d.synth.embedding import RigidFrame
@@ -57,6 +58,7 @@ class ThrowScene(TrueScene):
         return self._points.move(self._nodes[self._frame])
 
     def throw(self, velocity: np.ndarray) -> None:
+        """Gives the body, which was held until now, a ``velocity`` [3] in m/s."""
         self._nodes, self._frame = self._simulate(velocity, FRAMES + 1), 0
 
     def move(self, velocities: np.ndarray) -> None:
@@ -67,6 +69,15 @@ class ThrowScene(TrueScene):
         return simulate(setup, n_frames, FPS, pushing.SUBSTEP)[0].nodes
 
 
+class ThrowScenes(TrueScenes):
+    """:class:`ThrowScene` side by side."""
+
+    def throw(self, velocities: Tensor) -> None:
+        """Gives the bodies, which were held until now, ``velocities`` [n, 3] in m/s."""
+        for scene, velocity in zip(self.all, velocities.numpy(), strict=True):
+            scene.throw(velocity)
+
+
 class ThrowToTarget(TaskEnv):
     """Throw a body so that it comes to rest at a goal; solved where its centre is nearer than 10 cm after 1.5 seconds.
 
@@ -75,6 +86,7 @@ class ThrowToTarget(TaskEnv):
     """
 
     max_action = (MAX_SPEED,) * 3
+    true_scenes = ThrowScenes
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> ThrowScene:
@@ -89,7 +101,7 @@ class ThrowToTarget(TaskEnv):
         return ThrowScene(raised, at + polar(rng, GOAL_DISTANCE))
 
     @classmethod
-    def act(cls, scenes: Scenes, actions: Tensor) -> Tensor:
+    def act(cls, scenes: ThrowScenes | ModelScenes, actions: Tensor) -> Tensor:
         scenes.throw(actions)
         for _ in range(FRAMES):
             scenes.move(scenes.actors())

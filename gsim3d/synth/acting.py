@@ -120,9 +120,6 @@ class Push(World):
             bodies.append(pushing.draw_body(one, at, rng.uniform(0, 2 * np.pi), rng.uniform(*self.body_size), look))
         return 0.0, None, bodies
 
-    def _make_body(self, name, vertices, faces, velocity, spin, rng):
-        raise NotImplementedError("bodies of this world come from synth.pushing")
-
     def _with_actors(self, drawn: SceneDraw, rng: np.random.Generator) -> SceneDraw:
         centers = np.stack([_center(body) for body in drawn.bodies])
         scripted, speed = rng.random() < SCRIPTED, rng.uniform(*self.push_speed)

@@ -65,9 +65,6 @@ class ClothGrip(World):
         height = rng.uniform(*HEIGHTS)
         return 0.0, Cloth(width, height, n, mass, young, thickness=0.008, damping=0.015, held=held), []
 
-    def _make_body(self, name, vertices, faces, velocity, spin, rng):
-        raise NotImplementedError("this world has no bodies")
-
     def _with_actors(self, drawn: SceneDraw, rng: np.random.Generator) -> SceneDraw:
         points, faces = icosphere(1)
         n_grips = len(drawn.cloth.held)

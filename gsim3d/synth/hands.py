@@ -104,9 +104,6 @@ class Hands(World):
         look = None if self.by_name else rng
         return 0.0, None, [pushing.draw_body(name, place, angle, rng.uniform(*self.body_size), look)]
 
-    def _make_body(self, name, vertices, faces, velocity, spin, rng):
-        raise NotImplementedError("bodies of this world come from synth.pushing")
-
     def _with_actors(self, drawn: SceneDraw, rng: np.random.Generator) -> SceneDraw:
         vertices, axis = drawn.bodies[0].vertices, rng.uniform(0, 2 * np.pi)
         center = (vertices.min(0) + vertices.max(0)) / 2

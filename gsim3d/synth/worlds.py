@@ -12,6 +12,7 @@ from gsim3d.errors import InputError, did_you_mean
 from gsim3d.io.plain import parse_yaml
 from gsim3d.synth import bodies, meshes, shapes
 from gsim3d.synth.acting import Push
+from gsim3d.synth.falling import FallingWorld
 from gsim3d.synth.gripping import ClothGrip
 from gsim3d.synth.hands import Hands
 from gsim3d.synth.scene_setup import Cloth, Material, RigidBody, SoftBody
@@ -45,7 +46,7 @@ TINT_SHARE = 0.6
 
 
 @dataclass(frozen=True)
-class SoftWorld(World):
+class SoftWorld(FallingWorld):
     """Base class of worlds with soft bodies."""
 
     materials: tuple[str, ...] = ("jelly",)  #: materials, keys of MATERIALS
@@ -119,7 +120,7 @@ class ClothWorld(SoftWorld):
 
 
 @dataclass(frozen=True)
-class Rigid(World):
+class Rigid(FallingWorld):
     """One to three rigid bodies are thrown on a round ground, collide, roll and come to rest."""
 
     objects: tuple[str, ...] = shapes.RIGID_SHAPES
