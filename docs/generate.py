@@ -63,12 +63,14 @@ def commands() -> str:
 
 def configuration() -> str:
     """Every setting of a training run and of a model, from the dataclasses."""
+    from gsim3d.nn.graph_network import GraphConfig
     from gsim3d.presets import ModelConfig
     from gsim3d.train.config import TrainConfig
 
     sections: dict[type, str] = {}
     _collect(TrainConfig, "", sections)
     _collect(ModelConfig, "model", sections)
+    _collect(GraphConfig, "model.dynamics.graph", sections)
     return "\n".join(_section(kind, path) for kind, path in sections.items())
 
 

@@ -55,7 +55,8 @@ def run(args: argparse.Namespace) -> int:
     plan, work = own if spec is None else simulator.plan(spec), workload(scene, data)
     size = f"1 image of {scene.width}x{scene.height}"
     print(f"{scene.name}: {work.moving} moving and {work.frozen} frozen particles per step, {size}")
-    print(f"model: {args.checkpoint or 'preset tiny, untrained'}; effects: {source}, {plan.spec.hash}")
+    model = f"{args.checkpoint or 'preset tiny, untrained'}, {simulator.config.dynamics.network}"
+    print(f"model: {model}; effects: {source}, {plan.spec.hash}")
     for paragraph in plan_report(simulator, plan, work, times, own):
         print(f"\n{paragraph}")
     return 0

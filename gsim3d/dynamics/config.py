@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gsim3d.errors import InputError, check_ranges
+from gsim3d.nn.graph_network import MAX_HISTORY_BITS, GraphConfig, graph_spec
 from gsim3d.nn.point_transformer import TransformerConfig
+from gsim3d.ops.curve import PyramidSpec
 from gsim3d.priors import Prior, PriorConfig, PriorList
 
 PREDICTS = ("from_newest", "from_previous", "absolute")
@@ -14,9 +16,11 @@ BACKGROUNDS = ("symmetric", "asymmetric", "relightable")
 
 @dataclass(frozen=True, kw_only=True)
 class DynamicsConfig(TransformerConfig):
-    """Configuration of the dynamics: its outputs, priors and background, on top of the transformer's.
+    """Configuration of the dynamics: its network, outputs, priors and background, on top of the transformer's.
 
     Attributes:
+        graph: the network is a graph network of this size, which reads no settings of levels, patches and blocks;
+            None: the point transformer.
         dynamic_latents: channels of ``Particles.dynamic_latents``.
         static_latents: channels of ``Particles.static_latents``.
         explicit: particles carry Gaussian parameters (quats, scales, sh), which the network changes.
@@ -43,6 +47,7 @@ class DynamicsConfig(TransformerConfig):
             model has no action particles.
     """
 
+    graph: GraphConfig | None = None
     dynamic_latents: int = 32
     static_latents: int = 32
     explicit: bool = False
@@ -72,6 +77,12 @@ class DynamicsConfig(TransformerConfig):
             raise ValueError('DynamicsConfig: background="asymmetric" needs norm="layer"')
         if self.is_relightable and self.explicit:
             raise ValueError('DynamicsConfig: background="relightable" does not support explicit models')
+        if self.graph is not None and (self.norm == "batch" or self.is_asymmetric):
+            raise InputError('DynamicsConfig: graph needs norm="layer", and background="symmetric" or "relightable"')
+        if self.graph is not None and self.history_bits > MAX_HISTORY_BITS:
+            raise InputError(
+                f"DynamicsConfig: graph needs history_bits of at most {MAX_HISTORY_BITS}; got {self.history_bits}"
+            )
         if self.steps_per_call < 1:
             raise ValueError(f"DynamicsConfig: steps_per_call must be at least 1; got {self.steps_per_call}")
         check_ranges(self, position_length=(1e-6, 1e6), scale_max=(1e-6, 1e6), scale_min=(0, self.scale_max))
@@ -95,10 +106,25 @@ class DynamicsConfig(TransformerConfig):
             "a latent model (not explicit)": prior.latent_only and self.explicit,
             'background "symmetric" or "relightable"': prior.reads_background and self.is_asymmetric,
             "a model without actions": prior.acts and bool(self.actions),
+            "the point transformer (no graph)": self.graph and (prior.n_conv_features or prior.n_features),
         }
         for needed, lacks in needs.items():
             if lacks:
                 raise InputError(f"DynamicsConfig: prior {prior.name} needs {needed}")
+
+    @property
+    def network(self) -> str:
+        """Name of the network, for reports."""
+        return "point transformer" if self.graph is None else "graph network"
+
+    @property
+    def out_channels(self) -> int:
+        """Channels of a particle behind the network."""
+        return super().out_channels if self.graph is None else self.graph.channels
+
+    def pyramid_spec(self, history_bits: int) -> PyramidSpec:
+        """What the geometry op needs to know, for a history of up to 2^history_bits steps."""
+        return super().pyramid_spec(history_bits) if self.graph is None else graph_spec(self.grid_size, history_bits)
 
     @property
     def is_asymmetric(self) -> bool:

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import math
 from collections.abc import Iterator, Mapping
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -18,10 +19,12 @@ from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.dynamics.frozen_context import FrozenContext
 from gsim3d.dynamics.partition import Partition
 from gsim3d.dynamics.step import StateLayout
+from gsim3d.nn.graph_network import GraphNetwork
 from gsim3d.nn.point_transformer import PointTransformer
 from gsim3d.ops.curve import Pyramid, PyramidCapacity
 from gsim3d.priors import Motion, StepContext
 from gsim3d.priors.base import put_runs
+from gsim3d.priors.position_waves import relative_positions
 from gsim3d.state import (
     ASLEEP,
     FROZEN,
@@ -38,7 +41,7 @@ SLACK = 1.1  # capacity over the counted number of particles
 
 
 class Dynamics(nn.Module):
-    """Predicts the next step of particles by a point transformer and priors (:mod:`gsim3d.priors`).
+    """Predicts the next step of particles by a network and priors (:mod:`gsim3d.priors`).
 
     The network processes all steps of a history together and predicts a change of each particle of the newest step.
     Time slots count back from the newest step, so a model accepts histories of 1 to ``2 ** config.history_bits`` steps.
@@ -59,7 +62,8 @@ class Dynamics(nn.Module):
         self.layout = StateLayout.of(config, self.priors)
         for prior in self.priors:
             prior.connect(config.encoder_channels[0], config.out_channels)
-        self.net = PointTransformer(self.layout.in_channels, self.layout.out_channels, config, tuple(self.priors))
+        network = PointTransformer if config.graph is None else partial(GraphNetwork, config.graph)
+        self.net = network(self.layout.in_channels, self.layout.out_channels, config, tuple(self.priors))
         self.actions = ActionParticles(config) if config.actions else None
 
     def geometry(
@@ -250,8 +254,11 @@ class Dynamics(nn.Module):
         return self.layout.split(prediction, ctx.changes)
 
     def _features(self, ctx: StepContext) -> Tensor:
-        """Input channels [M, C] of the history: attributes, conv features of priors, then their other features."""
+        """Input channels [M, C] of the history: for a graph network positions in cells, then attributes, conv features
+        of priors, and their other features."""
         columns = [self.layout.pack(ctx.history)]
+        if self.config.graph is not None:
+            columns.insert(0, (relative_positions(ctx.history) / self.config.grid_size).to(columns[0]))
         for width, features in (("n_conv_features", "conv_features"), ("n_features", "features")):
             for prior in self.priors:
                 if n := getattr(prior, width):
@@ -327,7 +334,8 @@ class Dynamics(nn.Module):
         return tuple(slots), bits if from_newest else (longest - 1).bit_length()
 
     def _draw_curves(self, generator: torch.Generator | None) -> tuple[tuple[int, ...], ...] | None:
-        if generator is None or not (self.training and self.config.shuffle_orders):
+        shuffles = self.config.shuffle_orders and self.config.graph is None
+        if generator is None or not (self.training and shuffles):
             return None
         return tuple(
             tuple(torch.randperm(4, generator=generator, device=generator.device).tolist())

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.effects.spec import EffectsSpec, UnsupportedEffect
 from gsim3d.errors import InputError
+from gsim3d.nn.graph_network import KERNEL
 from gsim3d.nn.point_transformer import BLOCK_KERNEL, STEM_KERNEL
 from gsim3d.presets import ModelConfig
 from gsim3d.state import Particles
@@ -187,6 +188,8 @@ def _network(config: DynamicsConfig, particles: float, history: int, context: fl
     from gsim3d.dynamics.step import StateLayout
 
     layout, channels = StateLayout.of(config), config.encoder_channels
+    if config.graph is not None:
+        return _graph(config, layout.in_channels, layout.out_channels, particles, particles / history)
     merged = config.pyramid_spec((history - 1).bit_length()).merged_bits()
     total = particles * STEM_KERNEL**SURFACE * layout.in_channels * channels[0]
     levels = []
@@ -204,6 +207,13 @@ def _network(config: DynamicsConfig, particles: float, history: int, context: fl
         total += config.decoder_depths[s] * _block(config, particles, context, width, config.patch_sizes[s])
         below = width
     return float(total + particles / history * below * (below + layout.out_channels))
+
+
+def _graph(config: DynamicsConfig, inputs: int, outputs: int, particles: float, newest: float) -> float:
+    """Multiply-adds of a graph network on ``particles``, each a node, of which ``newest`` receive edges."""
+    width, layers, neighbours = config.graph.channels, config.graph.layers, KERNEL**SURFACE
+    dense = particles * (inputs + (4 + 5 * (1 + layers)) * width) + newest * (width + outputs)
+    return float((dense + neighbours * (3 * particles + (1 + 2 * layers) * newest) * width) * width)
 
 
 def _block(config: DynamicsConfig, particles: float, context: float, channels: int, patch: int) -> float:

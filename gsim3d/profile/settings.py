@@ -160,7 +160,8 @@ def _backgrounds(case: BenchmarkCase) -> list[Setting]:
 
 
 def _patches(case: BenchmarkCase) -> list[Setting]:
-    largest = max(case.restored.simulator.config.dynamics.patch_sizes)
+    dynamics = case.restored.simulator.config.dynamics
+    largest = max(dynamics.patch_sizes) if dynamics.graph is None else 0
     return [Setting(patch_size=n) for n in reversed([n for n in POWERS if 32 <= n < largest][-3:])]
 
 

@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 import torch
 
+from gsim3d.nn.graph_network import GraphConfig
 from gsim3d.ops import PyramidCapacity
 from gsim3d.state import ASLEEP
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
@@ -12,6 +13,7 @@ from tests.dynamics.scenes import EXPLICIT, SEEING, TINY, batch, float_fields, m
 
 MOVING = dataclasses.replace(TINY, priors=SEEING)
 RELIGHTABLE = dataclasses.replace(MOVING, background="relightable")
+GRAPH = dataclasses.replace(TINY, graph=GraphConfig(channels=16, layers=2), background="relightable")
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 SIZES = [[(40, 30)], [(1,)], [(0, 12)], [(12, 0)], [(40, 30), (3,), (5, 6, 7), (60, 0, 1, 2)]]
@@ -31,7 +33,7 @@ def with_room(dynamics, history, factor=1.25, generator=None):
 
 
 @pytest.mark.parametrize("asleep", [False, True])
-@pytest.mark.parametrize("config", [TINY, EXPLICIT, MOVING, RELIGHTABLE])
+@pytest.mark.parametrize("config", [TINY, EXPLICIT, MOVING, RELIGHTABLE, GRAPH])
 @pytest.mark.parametrize("sizes", SIZES)
 @pytest.mark.parametrize("factor", [1.0, 1.25, 4.0])
 def test_capacity_changes_no_bit(factor, sizes, config, asleep):

@@ -116,6 +116,7 @@ def test_state_becomes_simulator_with_card(scored, package, tmp_path):
     text = (folder / "README.md").read_text()
     scores = json.loads((folder / "scores.json").read_text())
     assert "## Limitations\n\n- It floats.\n\n## Licence" in text and "--seed 4321" in text
+    assert "- Dynamics: point transformer, " in text
     assert f"{scores['unseen']['future.psnr_masked']:.2f}" in text
     assert (tmp_path / f"{NAME}.png").is_file() and (tmp_path / f"{NAME}-frames.png").is_file()
     package.main([NAME, *paths])  # keeps the limitations

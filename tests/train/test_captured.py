@@ -96,6 +96,7 @@ ACTING = dataclasses.replace(
 )
 KINDS = {
     "latent": CONFIG,
+    "graph": dataclasses.replace(CONFIG, model={"dynamics": {"graph": {"channels": 16, "layers": 2}}}),
     "acting": ACTING,
     "all moving": ALL_MOVING,
     "moving": MOVING,
@@ -156,10 +157,11 @@ def run(captured, batch, trainer, report=None, factor=1.0):
         ({"horizon": 3, "cut": 2}, "relightable"),
         ({"horizon": 3, "cut": 2}, "flying"),
         ({"horizon": 3, "cut": 2}, "acting"),
+        ({}, "graph"),
     ],
     ids=[
         *("rollout", "encoded", "explicit", "masked", "moving", "moving, masked", "all moving", "relightable"),
-        *("flying", "acting"),
+        *("flying", "acting", "graph"),
     ],
     indirect=["trainer"],
 )
@@ -310,7 +312,7 @@ class Ops(TorchDispatchMode):
     "row",
     [
         *("latent", "explicit", "no-tem", "background-masked", "background-dynamic", "calls-2", "relightable"),
-        *("flying", "acting"),
+        *("flying", "acting", "graph"),
     ],
 )
 def test_captured_ops_have_fixed_sizes(row, scenes, tmp_path):

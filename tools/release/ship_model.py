@@ -29,6 +29,7 @@ from gsim3d.evaluate.pictures import write_curves  # noqa: E402
 from gsim3d.io import checkpoint  # noqa: E402
 from gsim3d.numerics.speed import SPEEDS_FILE  # noqa: E402
 from gsim3d.synth.worlds import VALIDATION_SEED  # noqa: E402
+from gsim3d.train.restore import model_config  # noqa: E402
 from tools.release.recipes import Recipe, recipe  # noqa: E402
 from tools.release.state import CURVE, load_progress, weights_file  # noqa: E402
 
@@ -66,7 +67,9 @@ def ship(name: str, made: Recipe, state: Path, scores: Path, limitations: str) -
     (folder / "training.jsonl").write_text("".join(json.dumps(logged(row)) + "\n" for row in kept))
     (folder / "scores.json").write_text(json.dumps(measured) + "\n")
     world = dataclasses.replace(made.stream(), seed=progress.runs[-1]["seed"])
+    size = sum(value.numel() for name, value in saved.weights.items() if name.startswith("dynamics."))
     described = {
+        "dynamics": f"{model_config(made.train).dynamics.network}, {size:,} parameters",
         "steps": progress.step,
         "training_seconds": progress.seconds,
         "skipped_steps": progress.n_skipped,
@@ -112,6 +115,7 @@ Research on learned simulation, and a start for training on similar scenes. Not 
 - Input: {data["history"]} steps from {data["context_views"]} calibrated cameras at {world["image_size"]} pixels,
   with masks, {world["fps"]:g} frames a second.
 - Output: particles of every later step, rendered as 3D Gaussians from any camera.
+- Dynamics: {recipe["dynamics"]}.
 
 ## How to load
 
