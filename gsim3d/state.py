@@ -545,6 +545,8 @@ class Gaussians(TensorRecord):
             None if colours are not needed.
         cu_rows: int64 [Q + 1], offsets of the clouds.
         world_offset: float64 [Q, 3] metres, ``world_offset`` of each cloud's scene; None: 0.
+        antialiased: of a file that was trained with Mip-Splatting's compensation: pictures, films and players multiply
+            opacities by it.
     """
 
     means: Tensor
@@ -554,3 +556,4 @@ class Gaussians(TensorRecord):
     sh: Tensor | None
     cu_rows: Tensor
     world_offset: Tensor | None = None
+    antialiased: bool = False

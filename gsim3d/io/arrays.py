@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,6 +33,7 @@ class Splats:
         scales: [N, 3] standard deviations, metres, positive.
         opacities: [N] in [0, 1].
         sh: [N, K, 3] coefficients of the 3DGS basis, K = (degree + 1)^2.
+        antialiased: as of :class:`gsim3d.state.Gaussians`.
     """
 
     means: np.ndarray
@@ -39,6 +41,7 @@ class Splats:
     scales: np.ndarray
     opacities: np.ndarray
     sh: np.ndarray
+    antialiased: bool = False
 
     @property
     def count(self) -> int:
@@ -72,7 +75,9 @@ def splats_of(gaussians: Gaussians, frame: int | None, path: Path) -> Splats:
     values["quats"] = unit_quats(values["quats"])
     values["scales"] = values["scales"].clamp(min=SMALLEST_SCALE)
     values["opacities"] = values["opacities"].clamp(0, 1)
-    return Splats(**{name: value.contiguous().numpy() for name, value in values.items()})
+    return Splats(
+        **{name: value.contiguous().numpy() for name, value in values.items()}, antialiased=gaussians.antialiased
+    )
 
 
 def span_of(gaussians: Gaussians, frame: int | None) -> slice:
@@ -94,7 +99,7 @@ def gaussians_of(splats: Splats, path: Path) -> Gaussians:
         raise InputError(f"{path}: a scale is negative")
     tensors = {name: torch.from_numpy(value) for name, value in values.items()}
     tensors["quats"] = unit_quats(tensors["quats"])
-    return Gaussians(**tensors, cu_rows=torch.tensor([0, splats.count]))
+    return Gaussians(**tensors, cu_rows=torch.tensor([0, splats.count]), antialiased=splats.antialiased)
 
 
 def turned(splats: Splats, quat: tuple[float, ...]) -> Splats:
@@ -104,7 +109,7 @@ def turned(splats: Splats, quat: tuple[float, ...]) -> Splats:
     sh = torch.from_numpy(splats.sh)
     if splats.degree:
         sh = rotate_harmonics(sh, torch.from_numpy(turn).expand(splats.count, 3, 3))
-    return Splats(splats.means @ turn.T, quats.numpy(), splats.scales, splats.opacities, sh.numpy())
+    return dataclasses.replace(splats, means=splats.means @ turn.T, quats=quats.numpy(), sh=sh.numpy())
 
 
 def colors_of(splats: Splats) -> np.ndarray:

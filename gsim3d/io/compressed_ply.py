@@ -6,6 +6,7 @@ opacity in 8 bits, harmonics above degree 0 in 8 bits between -4 and 4.
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from gsim3d.io.arrays import (
     unpack_tens,
 )
 from gsim3d.io.files import write_whole
-from gsim3d.io.ply_format import read_columns, read_header
+from gsim3d.io.ply_format import MIP, read_columns, read_header
 
 CHUNK = 256
 LOG_SCALES = 20.0  # limit of log-scales
@@ -58,7 +59,8 @@ def write(path: Path, splats: Splats) -> None:
     ).astype("<u4")
     rest = splats.sh[:, 1:].transpose(0, 2, 1).reshape(splats.count, 3 * (splats.sh.shape[1] - 1))
     levels = np.clip(np.trunc((rest / 8 + 0.5) * 256), 0, 255).astype(np.uint8)
-    header = ["ply", "format binary_little_endian 1.0", f"element chunk {n_chunks}"]
+    header = ["ply", "format binary_little_endian 1.0", *[f"comment {MIP}"] * splats.antialiased]
+    header.append(f"element chunk {n_chunks}")
     header += [f"property float {name}" for name in LIMITS]
     header += [f"element vertex {splats.count}", *(f"property uint {name}" for name in PACKED)]
     if rest.shape[1]:
@@ -77,7 +79,8 @@ def read(path: Path) -> Splats:
     content = read_bytes(path, b"ply")
     if not is_compressed(content):
         raise InputError(f"{path}: not a compressed .ply")
-    tables = read_columns(path, content, read_header(path, content), "chunk", "vertex", "sh")
+    header = read_header(path, content)
+    tables = read_columns(path, content, header, "chunk", "vertex", "sh")
     for name, needed, kind in (("chunk", LIMITS[:12], "f"), ("vertex", PACKED, "u")):
         missing = [key for key in needed if key not in tables.get(name, ()) or tables[name][key].dtype.kind != kind]
         if missing:
@@ -104,6 +107,7 @@ def read(path: Path) -> Splats:
         scales=np.exp(np.clip(log_scales, -LOG_SCALES, LOG_SCALES)),
         opacities=bytes_of[:, 3],
         sh=np.concatenate([dc_of(between(bytes_of[:, :3], "", "rgb"))[:, None], _rest(path, tables, count)], 1),
+        antialiased=header.is_mip,
     )
 
 
@@ -132,7 +136,7 @@ def _sorted(splats: Splats) -> Splats:
         for axis in range(3):
             code |= ((cells[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
     order = np.argsort(code, kind="stable")
-    return Splats(*(getattr(splats, name)[order] for name in FIELDS))
+    return dataclasses.replace(splats, **{name: getattr(splats, name)[order] for name in FIELDS})
 
 
 def _between(values: np.ndarray, n_chunks: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -26,6 +26,7 @@ class Format:
         read: reads the (first) frame; None: it is not read.
         up: axis that points up in a file, unless it is said otherwise; None: the file says it itself.
         most_degree: of spherical harmonics that it keeps.
+        says_antialiased: whether it keeps ``antialiased``.
         has_time: whether one file holds a sequence.
     """
 
@@ -34,16 +35,22 @@ class Format:
     read: Callable[[Path], Splats] | None
     up: str | None = "z"
     most_degree: int = 3
+    says_antialiased: bool = False
     has_time: bool = False
 
 
 FORMATS = {
     ".compressed.ply": Format(
-        "positions in 11, 10 and 11 bits of a chunk of 256, colours in 8", compressed_ply.write, compressed_ply.read
+        "positions in 11, 10 and 11 bits of a chunk of 256, colours in 8",
+        compressed_ply.write,
+        compressed_ply.read,
+        says_antialiased=True,
     ),
-    ".ply": Format("3DGS layout, float32", None, None),
+    ".ply": Format("3DGS layout, float32", None, None, says_antialiased=True),
     ".splat": Format("float32 positions and scales, colours in 8 bits", splat.write, splat.read, most_degree=0),
-    ".spz": Format("positions to 0.13 mm, colours in 8 bits; version 3", spz.write, spz.read, up="y"),
+    ".spz": Format(
+        "positions to 0.13 mm, colours in 8 bits; version 3", spz.write, spz.read, up="y", says_antialiased=True
+    ),
     ".glb": Format("glTF with KHR_gaussian_splatting, float32", gltf.write, gltf.read, up=None),
     ".usdc": Format("USD particle field, float32, with time", usd.write, usd.read, up=None, has_time=True),
     ".usda": Format("USD as text", usd.write, usd.read, up=None, has_time=True),
@@ -90,6 +97,9 @@ def write_splats(
     keeps_offset = suffix == ".ply" and turn is None
     if not keeps_offset:
         _warn_of_offset(path, parts)
+    if not chosen.says_antialiased and any(part.antialiased for part in parts):
+        message = f"{path}: {suffix} does not say that Gaussians are antialiased: small ones will appear too bright"
+        warnings.warn(message, FitWarning, stacklevel=2)
     if chosen.has_time:
         frames = [
             splats_of(part, index, path)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from gsim3d.cameras import Cameras
-from gsim3d.ops import rasterize_gaussians
+from gsim3d.ops import project_gaussians, rasterize_gaussians
 from gsim3d.state import Gaussians
 
 ELEVATION, FIELD_OF_VIEW = 25.0, 42.0  # degrees
@@ -40,13 +40,14 @@ def camera_around(gaussians: Gaussians, azimuth: float, size: int) -> Cameras:
     return _camera(*_reach(gaussians), azimuth, size)
 
 
+@torch.no_grad()
 def picture(gaussians: Gaussians, camera: Cameras, background: torch.Tensor | None = None) -> np.ndarray:
     """One image uint8 [H, W, 3]."""
     image = rasterize_gaussians(
         gaussians.means,
         gaussians.quats,
         gaussians.scales,
-        gaussians.opacities,
+        _opacities(gaussians, camera),
         camera,
         sh=gaussians.sh,
         background=background,
@@ -54,6 +55,14 @@ def picture(gaussians: Gaussians, camera: Cameras, background: torch.Tensor | No
         on_invalid="drop",
     ).color[0]
     return (image.clamp(0, 1) * 255).round().byte().numpy()
+
+
+def _opacities(gaussians: Gaussians, camera: Cameras) -> torch.Tensor:
+    """[N], times the compensation where the Gaussians are antialiased."""
+    if not gaussians.antialiased:
+        return gaussians.opacities
+    fields = (gaussians.means, gaussians.quats, gaussians.scales)
+    return gaussians.opacities * project_gaussians(*fields, camera, antialiased=True).compensations
 
 
 def _reach(gaussians: Gaussians) -> tuple[torch.Tensor, float]:

@@ -7,6 +7,7 @@ One vertex a Gaussian, float32: x y z (float64 where they have a ``world_offset`
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import warnings
 from pathlib import Path
@@ -18,7 +19,7 @@ from torch import Tensor
 from gsim3d.errors import InputError
 from gsim3d.io.arrays import FIELDS, MAX_BYTES, SMALLEST_SCALE, dc_of, span_of, splats_of
 from gsim3d.io.files import read_file, write_whole
-from gsim3d.io.ply_format import MAX_HEADER, Header, read_columns, read_header
+from gsim3d.io.ply_format import MAX_HEADER, MIP, Header, read_columns, read_header
 from gsim3d.math.rotations import unit_quats
 from gsim3d.state import Gaussians
 
@@ -58,7 +59,8 @@ def write_ply(path: str | Path, gaussians: Gaussians, cloud: int | None = None) 
     table = np.empty(splats.count, [(name, "<f8" if kind == "double" else "<f4") for name, kind in zip(names, kinds)])
     for i, name in enumerate(names):
         table[name] = positions[:, i] if i < 3 else numbers[:, i - 3]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {splats.count}"]
+    header = ["ply", "format binary_little_endian 1.0", *[f"comment {MIP}"] * splats.antialiased]
+    header.append(f"element vertex {splats.count}")
     header += [f"property {kind} {name}" for name, kind in zip(names, kinds)] + ["end_header\n"]
     write_whole(path, "\n".join(header), table.tobytes())
 
@@ -73,8 +75,9 @@ def read_ply(path: str | Path) -> Gaussians:
     """Reads Gaussians of a .ply as one cloud: 3DGS or 2DGS, binary or text, properties in any order, others ignored.
 
     Colours are f_dc_*, or red, green, blue. 2DGS, which has two scales, becomes Gaussians of thickness 1e-9 m. Where
-    float32 does not hold the positions, they count from a ``world_offset``. A warning says that harmonics of degree 4
-    were dropped, or that the Gaussians were trained with an antialiasing that is not drawn here.
+    float32 does not hold the positions, they count from a ``world_offset``. They are ``antialiased`` where a comment
+    says ``SplatRenderMode: mip`` or where they have Mip-Splatting's filter_3D, which is then part of scales and
+    opacities. A warning says that harmonics of degree 4 were dropped.
 
     Raises:
         InputError: not a .ply, truncated, compressed, or a property is missing; the message names file and property.
@@ -83,30 +86,24 @@ def read_ply(path: str | Path) -> Gaussians:
     try:
         header = read_header(path, read_file(path, MAX_BYTES, MAX_HEADER))
         content = read_file(path, MAX_BYTES)
-        _check_kind(path, header)
+        is_mip = _is_mip(path, header)
         table = read_columns(path, content, header, "vertex").get("vertex")
         if table is None:
             raise InputError(f"{path}: the header has no usable element vertex")
-        return _gaussians(path, table)
+        return dataclasses.replace(_gaussians(path, table), antialiased=is_mip)
     except MemoryError:
         raise InputError(f"{path} cannot be read: no memory for its Gaussians") from None
 
 
-def _check_kind(path: Path, header: Header) -> None:
+def _is_mip(path: Path, header: Header) -> bool:
+    """Whether Gaussians were trained with Mip-Splatting's compensation. Raises InputError for a compressed file."""
     names = {name for element in header.elements for name, _, _ in element.properties}
     if packed := sorted(name for name in names if name.startswith("packed_")):
         raise InputError(
             f"{path}: a compressed .ply (it has {packed[0]}); write it uncompressed first, for example with "
             "splat-transform"
         )
-    mips = [text for text in header.comments if re.match(r"splatrendermode\s*:\s*mip", text, re.IGNORECASE)]
-    if "filter_3D" in names or mips:
-        what = "filter_3D" if "filter_3D" in names else mips[0][:40]
-        warnings.warn(
-            f"{path}: trained with antialiasing ({what}), which is not drawn here: splats smaller than a pixel appear "
-            "too bright",
-            stacklevel=3,
-        )
+    return "filter_3D" in names or header.is_mip
 
 
 def _gaussians(path: Path, table: dict[str, np.ndarray]) -> Gaussians:
@@ -120,11 +117,15 @@ def _gaussians(path: Path, table: dict[str, np.ndarray]) -> Gaussians:
     scales = torch.exp(stack(["scale_0", "scale_1"] if _is_flat(table) else ["scale_0", "scale_1", "scale_2"]))
     if _is_flat(table):
         scales = torch.cat([scales, torch.full_like(scales[:, :1], SMALLEST_SCALE)], 1)
+    opacities = torch.sigmoid(stack(["opacity"])[:, 0])
+    if "filter_3D" in table:  # a 3D Gaussian of that standard deviation, with which these are convolved
+        own, scales = scales, torch.hypot(scales, stack(["filter_3D"]))
+        opacities = opacities * (own / scales.clamp_min(SMALLEST_SCALE)).prod(1)
     gaussians = Gaussians(
         means=means,
         quats=unit_quats(stack(["rot_0", "rot_1", "rot_2", "rot_3"])),
         scales=scales,
-        opacities=torch.sigmoid(stack(["opacity"])[:, 0]),
+        opacities=opacities,
         sh=_colors(path, stack, table).contiguous(),
         cu_rows=torch.tensor([0, means.shape[0]]),
         world_offset=offset,

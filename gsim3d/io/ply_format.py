@@ -10,6 +10,7 @@ import numpy as np
 
 from gsim3d.errors import InputError
 
+MIP = "SplatRenderMode: mip"  # comment of files that were trained with Mip-Splatting's compensation
 MAX_HEADER = 65536  # bytes
 MAX_DIGITS = 15  # of a count
 MAX_LIST_ROWS = 100_000  # rows with lists are read one by one
@@ -53,6 +54,11 @@ class Header:
     elements: list[Element]
     comments: list[str]
     end: int
+
+    @property
+    def is_mip(self) -> bool:
+        """Whether a comment says so, as MIP does."""
+        return any(re.match(r"splatrendermode\s*:\s*mip", text, re.IGNORECASE) for text in self.comments)
 
 
 def read_header(path: Path, content: bytes) -> Header:

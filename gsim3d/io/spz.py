@@ -18,6 +18,7 @@ from gsim3d.io.arrays import Splats, from_smallest_three, pack_tens, read_bytes,
 from gsim3d.io.files import write_whole
 
 MAGIC = 0x5053474E
+ANTIALIASED = 1  # bit of the flags
 GZIP, ZSTD = b"\x1f\x8b", b"NGSP"  # beginnings of versions 2 and 3, and of version 4
 FRACTION_BITS = 12
 LEAST_RATIO = 1024 / 9  # points a byte: gzip packs no better
@@ -38,7 +39,7 @@ def write(path: Path, splats: Splats) -> None:
     colors = np.clip(np.round(splats.sh[:, 0] * (COLOR_SCALE * 255) + 127.5), 0, 255).astype(np.uint8)
     scales = np.clip(np.round((np.log(splats.scales.astype(np.float64)) + 10) * 16), 0, 255).astype(np.uint8)
     parts = [positions, alphas, colors, scales, _pack_rotations(splats.quats), _pack_harmonics(splats.sh[:, 1:])]
-    header = HEADER.pack(MAGIC, 3, splats.count, splats.degree, bits, 0, 0)
+    header = HEADER.pack(MAGIC, 3, splats.count, splats.degree, bits, ANTIALIASED * splats.antialiased, 0)
     body = header + b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
     write_whole(path, gzip.compress(body, mtime=0))
 
@@ -59,7 +60,7 @@ def _read_gzip(path: Path, content: bytes) -> Splats:
         head = stream.decompress(content, HEADER.size)
         if len(head) < HEADER.size:
             raise InputError(f"{path}: truncated within its header")
-        version, count, degree, bits, sizes = _checked(path, head, len(content))
+        version, count, degree, bits, is_mip, sizes = _checked(path, head, len(content))
         if version not in (2, 3):
             raise InputError(f"{path}: version {version} of .spz is not read; versions 2, 3 and 4 are")
         body = stream.decompress(stream.unconsumed_tail, sum(sizes)) if sum(sizes) else b""
@@ -70,14 +71,14 @@ def _read_gzip(path: Path, content: bytes) -> Splats:
     if len(body) < sum(sizes) or not stream.eof:
         raise InputError(f"{path}: truncated: {len(body)} bytes of {count} Gaussians; expected {sum(sizes)}")
     bounds = np.cumsum([0, *sizes])
-    return _decoded(version, count, degree, bits, [body[a:b] for a, b in zip(bounds, bounds[1:])])
+    return _decoded(version, count, degree, bits, is_mip, [body[a:b] for a, b in zip(bounds, bounds[1:])])
 
 
 def _read_streams(path: Path, content: bytes) -> Splats:
     """Version 4: one zstd frame an attribute."""
     if len(content) < 32:
         raise InputError(f"{path}: truncated within its header")
-    version, count, degree, bits, sizes = _checked(path, content[: HEADER.size], len(content))
+    version, count, degree, bits, is_mip, sizes = _checked(path, content[: HEADER.size], len(content))
     n_streams, table = struct.unpack_from("<BI", content, 15)
     expected = [size for size in sizes if size] if count else sizes[: 6 if degree else 5]
     if version != 4 or n_streams != (6 if degree else 5):
@@ -104,12 +105,12 @@ def _read_streams(path: Path, content: bytes) -> Splats:
             )
         parts.append(part)
         begin += packed
-    return _decoded(version, count, degree, bits, parts + [b""] * (6 - n_streams))
+    return _decoded(version, count, degree, bits, is_mip, parts + [b""] * (6 - n_streams))
 
 
-def _checked(path: Path, head: bytes, n_bytes: int) -> tuple[int, int, int, int, list[int]]:
-    """Version, count, degree, fraction bits and the sizes of the six arrays."""
-    magic, version, count, degree, bits, _, _ = HEADER.unpack(head[: HEADER.size])
+def _checked(path: Path, head: bytes, n_bytes: int) -> tuple[int, int, int, int, bool, list[int]]:
+    """Version, count, degree, fraction bits, whether antialiased, and the sizes of the six arrays."""
+    magic, version, count, degree, bits, flags, _ = HEADER.unpack(head[: HEADER.size])
     if magic != MAGIC:
         raise InputError(f"{path}: not a .spz file")
     if count > n_bytes * LEAST_RATIO:
@@ -117,10 +118,10 @@ def _checked(path: Path, head: bytes, n_bytes: int) -> tuple[int, int, int, int,
     if degree >= len(N_REST) or bits > 23:
         raise InputError(f"{path}: degree {degree} with {bits} fraction bits; degrees 0 to 3 are read")
     per_point = (9, 1, 3, 3, 3 if version == 2 else 4, 3 * N_REST[degree])
-    return version, count, degree, bits, [count * size for size in per_point]
+    return version, count, degree, bits, bool(flags & ANTIALIASED), [count * size for size in per_point]
 
 
-def _decoded(version: int, count: int, degree: int, bits: int, parts: list[bytes]) -> Splats:
+def _decoded(version: int, count: int, degree: int, bits: int, is_mip: bool, parts: list[bytes]) -> Splats:
     positions, alphas, colors, scales, rotations, rest = (np.frombuffer(part, np.uint8) for part in parts)
     fixed = np.zeros((count, 3, 4), np.uint8)
     fixed[:, :, :3] = positions.reshape(count, 3, 3)
@@ -130,7 +131,7 @@ def _decoded(version: int, count: int, degree: int, bits: int, parts: list[bytes
     dc = (colors.reshape(count, 3) / 255.0 - 0.5) / COLOR_SCALE
     harmonics = (rest.reshape(count, N_REST[degree], 3) - 128.0) / 128
     sh = np.concatenate([dc[:, None], harmonics], 1)
-    return Splats(means, quats, np.exp(scales.reshape(count, 3) / 16.0 - 10), alphas / 255.0, sh)
+    return Splats(means, quats, np.exp(scales.reshape(count, 3) / 16.0 - 10), alphas / 255.0, sh, is_mip)
 
 
 def _pack_harmonics(rest: np.ndarray) -> np.ndarray:

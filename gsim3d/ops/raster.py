@@ -77,7 +77,7 @@ def rasterize_gaussians(
             and ``far`` are not read.
         sh: [N, K, 3], K = 1, 4, 9 or 16 coefficients of real spherical harmonics in the standard 3DGS basis and order;
             colour = sum + 0.5, clamped at 0. The direction is W^T (W mean + t), W and t from ``viewmats``.
-        colors: [N, 3], in place of ``sh``.
+        colors: [N, 3], in place of ``sh``. Both may be float16, as are their gradients then.
         features: [N, F] extra channels, any F.
         background: [3] or [I, 3]; default black.
         cu_rows: int64 [Q + 1], rows of cloud q are cu_rows[q] .. cu_rows[q + 1]; default one cloud.
@@ -128,15 +128,15 @@ def rasterize_gaussians(
     if not compiling:
         optional = {"sh": sh, "colors": colors, "features": features, "background": background, "cu_rows": cu_rows}
         _check_arguments(rows, {k: v for k, v in optional.items() if v is not None}, cameras, near_plane)
-    _check_choices(sh, colors, cutoff, jacobian)
+    name, color = _check_choices(sh, colors, cutoff, jacobian)
     check_on_invalid(on_invalid)
     n, n_images = means.shape[0], cameras.viewmats.shape[0]
-    rows |= {"sh": sh} if colors is None else {"colors": colors}  # type: ignore[dict-item]  # one of them is given
+    real = torch.float64 if means.dtype == torch.float64 else torch.float32
+    rows[name] = color.to(real) if color.dtype == torch.float16 else color
     rows["features"] = means.new_empty(n, 0) if features is None else features
     if on_invalid == "clamp":
         _check_rows(rows)
         rows = _clamped(rows, report)
-    real = torch.float64 if means.dtype == torch.float64 else torch.float32
     if cu_rows is None:
         cu_rows = torch.tensor([0, n], device=means.device)
     watch = not compiling and _is_watched(on_invalid, report, means)
@@ -231,7 +231,8 @@ def _check_arguments(rows: dict[str, Tensor], optional: dict[str, Tensor], camer
             raise ValueError(f"rasterize_gaussians: {name} must be {shape}; got {list(value.shape)}")
 
 
-def _check_choices(sh: Tensor | None, colors: Tensor | None, cutoff: str, jacobian: str) -> None:
+def _check_choices(sh: Tensor | None, colors: Tensor | None, cutoff: str, jacobian: str) -> tuple[str, Tensor]:
+    """Returns the name and the tensor of colours."""
     if (sh is None) == (colors is None):
         raise ValueError("rasterize_gaussians: give one of sh and colors")
     for name, value, known in (("cutoff", cutoff, CUTOFFS), ("jacobian", jacobian, JACOBIANS)):
@@ -240,6 +241,7 @@ def _check_choices(sh: Tensor | None, colors: Tensor | None, cutoff: str, jacobi
     name, color, shape = ("sh", sh, "[N, K, 3]") if colors is None else ("colors", colors, "[N, 3]")
     if color.dim() != shape.count(",") + 1:
         raise ValueError(f"rasterize_gaussians: {name} must be {shape}; got {list(color.shape)}")
+    return name, color
 
 
 def _check_rows(rows: dict[str, Tensor]) -> None:

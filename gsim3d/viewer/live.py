@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +15,10 @@ import torch
 from torch import Tensor
 
 from gsim3d.data import Scene
-from gsim3d.errors import InputError, did_you_mean
+from gsim3d.errors import FitWarning, InputError, did_you_mean
 from gsim3d.io.arrays import colors_of, dc_of, splats_of
+from gsim3d.io.orbit import picture
 from gsim3d.math.rotations import rotation_matrices, rotation_to_quat
-from gsim3d.ops import rasterize_gaussians
 from gsim3d.state import ASLEEP, DYNAMIC, FROZEN, Gaussians, Particles
 from gsim3d.viewer.export import write_frames
 
@@ -333,10 +334,7 @@ class Target:
         images = [np.zeros(shape, np.uint8) if truth is None else truth[0]]
         if gaussians is not None:
             camera = self.scene.cameras_at([cam], [self.first + frame])
-            fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
-            with torch.no_grad():
-                color = rasterize_gaussians(*fields, camera, sh=gaussians.sh, on_invalid="drop").color[0]
-            images.append((color.clamp(0, 1) * 255).round().byte().numpy())
+            images.append(picture(gaussians, camera))
         return np.concatenate(images, 1)
 
 
@@ -347,6 +345,9 @@ def splatting_of(gaussians: Gaussians, unit: float) -> tuple[np.ndarray, np.ndar
         Centres [N, 3], covariances [N, 3, 3], colours [N, 3] in [0, 1] without view dependence, opacities [N, 1].
     """
     splats = splats_of(gaussians, None, Path("viewer"))
+    if splats.antialiased:
+        message = "antialiased Gaussians: the viewer draws small ones too bright; gsim3d export (.mp4, .html) does not"
+        warnings.warn(message, FitWarning, stacklevel=2)
     rotations = rotation_matrices(torch.from_numpy(splats.quats)).numpy()
     scaled = rotations * np.clip(splats.scales / unit, *HELD)[:, None]
     rgbs = np.clip(colors_of(splats), 0, 1).astype(np.float32)

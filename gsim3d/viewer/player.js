@@ -58,6 +58,7 @@ uniform vec4 lens;      // fx, fy, cx, cy in pixels of the canvas
 uniform vec2 canvas;
 uniform float nearPlane;
 uniform int nHarmonics;
+uniform bool antialiased;
 in vec2 corner;
 in uint index;
 out vec3 color; out vec3 conic; out vec2 offset; out float opacity;
@@ -70,7 +71,7 @@ void main() {
   vec3 p = (viewmat * vec4(world, 1.0)).xyz;
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
   opacity = look.a;
-  if (p.z <= nearPlane || opacity < 1.0 / 255.0) return;
+  if (p.z <= nearPlane) return;
   vec4 q = normalize(texelFetch(quats, at(i), 0));
   float w = q.x, x = q.y, y = q.z, z = q.w;
   mat3 turn = mat3(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + w * z), 2.0 * (x * z - w * y),
@@ -83,6 +84,8 @@ void main() {
   vec3 a = rowX * half_, b = rowY * half_;
   float xx = dot(a, a) + 0.3, xy = dot(a, b), yy = dot(b, b) + 0.3, det = xx * yy - xy * xy;
   if (!(det > 0.0)) return;
+  if (antialiased) opacity *= sqrt(max(0.0, ((xx - 0.3) * (yy - 0.3) - xy * xy) / det));
+  if (opacity < 1.0 / 255.0) return;
   conic = vec3(yy, -xy, xx) / det;
   float reach = sqrt(2.0 * log(255.0 * opacity));   // where alpha falls below 1 / 255
   vec2 size = min(reach * sqrt(vec2(xx, yy)), 4.0 * canvas);
@@ -258,6 +261,7 @@ async function main() {
     gl.uniform2f(uniform("canvas"), width, height);
     gl.uniform1f(uniform("nearPlane"), Math.min(0.01, 0.01 * camera.distance));
     gl.uniform1i(uniform("nHarmonics"), nHarmonics);
+    gl.uniform1i(uniform("antialiased"), header.antialiased);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
     player.painted = [frame, ticket];
   }

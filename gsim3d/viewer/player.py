@@ -91,7 +91,7 @@ def write_player(
     header |= {"fps": fps, "title": title, "background": list(background), "start": start}
     first = gaussians_of(splats[0], path)
     view = _around(first) if view is None else view
-    header["view"] = _view(view)
+    header["view"], header["antialiased"] = _view(view), first.antialiased
     header["truth"] = _encoded(path, truth) if truth is not None else []
     scripts = "".join(
         f'<script type="text/plain" id="blob{index}">{base64.b64encode(blob).decode()}</script>\n'

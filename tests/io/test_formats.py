@@ -12,10 +12,11 @@ import torch
 
 from gsim3d.cameras import Cameras
 from gsim3d.cli.main import main
+from gsim3d.compat.gsplat import rasterization
 from gsim3d.errors import FitWarning, InputError
-from gsim3d.io import FORMATS, read_splats, write_ply, write_splats
+from gsim3d.io import FORMATS, orbit, read_splats, write_ply, write_splats
 from gsim3d.io.arrays import Y_TO_Z_UP, Z_TO_Y_UP, splats_of, turned
-from gsim3d.io.orbit import orbit_frames
+from gsim3d.io.orbit import camera_around, orbit_frames
 from gsim3d.io.sequence import open_sequence, write_about
 from gsim3d.ops import rasterize_gaussians
 from gsim3d.state import Gaussians
@@ -334,6 +335,30 @@ def test_sequence_reads_its_rate(tmp_path):
     write_splats(folder / "other.splat", make(2, 0))
     with pytest.raises(InputError, match="several formats"):
         open_sequence(folder)
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_formats_keep_antialiased_or_warn(suffix, tmp_path, recwarn):
+    needs(suffix)
+    file = tmp_path / f"a{suffix}"
+    write_splats(file, dataclasses.replace(make(3, 1), antialiased=True))
+    said = [str(warning.message) for warning in recwarn.list if "antialiased" in str(warning.message)]
+    assert read_splats(file).antialiased is (suffix in (".ply", ".compressed.ply", ".spz"))
+    assert len(said) == (not read_splats(file).antialiased)
+    if suffix == ".ply":
+        assert read_splats(file, up="y").antialiased
+
+
+def test_pictures_of_antialiased_gaussians_are_compensated():
+    small = make(60, 2)
+    small = dataclasses.replace(small, scales=small.scales / 4, antialiased=True)
+    camera = camera_around(small, 0.3, 48)
+    fields = (small.means, small.quats, small.scales, small.opacities, small.sh)
+    options = {"sh_degree": 2, "rasterize_mode": "antialiased"}
+    expected = rasterization(*fields, camera.viewmats, camera.Ks, 48, 48, **options)[0][0]
+    found, plain = (orbit.picture(g, camera) for g in (small, dataclasses.replace(small, antialiased=False)))
+    assert np.abs(found - 255.0 * expected.clamp(0, 1).numpy()).max() <= 1
+    assert plain.mean() > 2 * found.mean() > 0
 
 
 def test_orbit_frames_show_the_scene():

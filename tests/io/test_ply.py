@@ -253,15 +253,29 @@ def test_read_ply_bounds_rows_with_lists(tmp_path, monkeypatch):
         ([], ("splatrendermode:mip-splatting",)),
     ],
 )
-def test_read_ply_warns_of_antialiased_training(properties, comments, tmp_path):
+def test_read_ply_knows_antialiased_training(properties, comments, tmp_path):
     row = [1, 2, 3, 0, 0, 0, *SHAPE, *([0.5] * len(properties))]
-    with pytest.warns(UserWarning, match="trained with antialiasing"):
-        read(tmp_path, rows_of(XYZ + DC + REST + properties, [row], comments=comments))
+    found = read(tmp_path, rows_of(XYZ + DC + REST + properties, [row], comments=comments))
+    assert found.antialiased
+    write_ply(tmp_path / "b.ply", found)
+    again = read_ply(tmp_path / "b.ply")
+    assert again.antialiased and torch.allclose(again.scales, found.scales)
 
 
-def test_read_ply_does_not_warn_otherwise(tmp_path, recwarn):
-    read(tmp_path, rows_of(XYZ + DC + REST, [[1, 2, 3, 0, 0, 0, *SHAPE]], comments=("SplatRenderMode: default",)))
-    assert not recwarn.list
+def test_filter_3d_is_part_of_scales_and_opacities(tmp_path):
+    """A Gaussian convolved with one of standard deviation f keeps its integral."""
+    row, f = [1, 2, 3, 0, 0, 0, *SHAPE], 0.5
+    plain = read(tmp_path, rows_of(XYZ + DC + REST, [row]))
+    found = read(tmp_path, rows_of([*XYZ, *DC, *REST, ("float", "filter_3D")], [[*row, f]]))
+    assert torch.allclose(found.scales, (plain.scales**2 + f**2).sqrt())
+    integrals = [gaussians.opacities * gaussians.scales.prod(1) for gaussians in (plain, found)]
+    assert torch.allclose(*integrals) and found.opacities < plain.opacities
+
+
+def test_read_ply_of_classic_training(tmp_path, recwarn):
+    row = [1, 2, 3, 0, 0, 0, *SHAPE]
+    found = read(tmp_path, rows_of(XYZ + DC + REST, [row], comments=("SplatRenderMode: default",)))
+    assert not recwarn.list and not found.antialiased
 
 
 def test_write_ply_refuses_gaussians_without_colours(tmp_path):

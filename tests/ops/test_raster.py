@@ -301,6 +301,23 @@ def test_images_do_not_see_each_other(device):
         assert_close_relative_to_max(a, e, 1e-6, name)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("sh_terms", [0, 4])
+def test_float16_colors(device, sh_terms, dtype):
+    scene = random_scene(n=20, sh_terms=sh_terms, dtype=dtype).to(device)
+    leaves = [x.detach().clone() for x in scene.inputs]
+    half = leaves[4].half().requires_grad_()
+    full = half.detach().to(dtype).requires_grad_()
+    grads = []
+    for color in (half, full):
+        images = scene.render(*leaves[:4], color, *leaves[5:])
+        grads += torch.autograd.grad(images, color, scene.cotangents())
+        assert images[0].dtype == dtype
+        assert_same_bits(images[0], scene.render(*leaves[:4], full, *leaves[5:])[0])
+    assert grads[0].dtype == torch.float16 and grads[1].abs().max() > 0
+    assert_same_bits(grads[0], grads[1].half())
+
+
 def test_autocast_renders_in_float32(device):
     scene = random_scene(n=20, dtype=torch.float32).to(device)
     expected = scene.render()

@@ -15,6 +15,7 @@ import torch
 from gsim3d.cameras import Cameras
 from gsim3d.errors import InputError
 from gsim3d.evaluate.metrics import psnr
+from gsim3d.io.orbit import picture
 from gsim3d.math.rotations import rotate_left
 from gsim3d.math.spherical_harmonics import SH_0
 from gsim3d.ops import rasterize_gaussians
@@ -258,6 +259,30 @@ def test_player_with_reduced_motion_loops_and_is_touched(tmp_path):
         browser.touch([(180, 200)], [(200, 180)], [(240, 180)])
         browser.wait("player.idle")
         assert np.abs(canvas_of(browser) - before).max() > 60 and not browser.complaints
+
+
+@browsing
+def test_player_compensates_antialiased_gaussians(tmp_path):
+    seen, one = view(), torch.ones(1)
+    small = make(400, 1)
+    small = dataclasses.replace(small, scales=small.scales / 50, antialiased=True)
+    write_player(tmp_path / "a.html", [small], fps=FPS, view=seen)
+    with Browser(SIZE, SIZE) as browser:
+        browser.open((tmp_path / "a.html").as_uri())
+        browser.wait("globalThis.player && player.painted !== null && player.idle")
+        image = canvas_of(browser)
+        assert not browser.complaints
+    side = min(image.shape[:2])
+    top, left = ((length - side) // 2 for length in image.shape[:2])
+    K = torch.from_numpy(seen.K * np.array([[side / SIZE], [side / SIZE], [1]]))[None].float()
+    viewmat = torch.from_numpy(seen.viewmat)[None].float()
+    camera = Cameras(viewmat, K, 0.1 * one, 20 * one, torch.tensor([0]), side, side)
+    shown, expected = (
+        torch.from_numpy(np.ascontiguousarray(x))[None].float() / 255
+        for x in (image[top : top + side, left : left + side], picture(small, camera))
+    )
+    assert float(psnr(shown, expected)) > 35
+    assert abs(float(shown.mean() / expected.mean()) - 1) < 0.05
 
 
 @browsing
