@@ -36,7 +36,7 @@ from gsim3d.simulator import Simulator
 from gsim3d.state import ASLEEP, DYNAMIC, Particles
 from gsim3d.train.gradients import in_segments, recomputing
 from gsim3d.train.left_out import draw_left_out, images_per_cloud, with_views
-from gsim3d.train.samples import Batch
+from gsim3d.train.samples import Batch, displaced
 
 FACTOR = 1.5  # geometry capacity over the observed size; smaller causes more captures, larger makes steps slower
 PARTICLES_FACTOR = 1.15  # capacity of a cloud over the observed number of particles
@@ -231,6 +231,7 @@ class _Step:
         batch, self._clouds = prepared.batch, prepared.kind[:2]
         self._context, self._targets = batch.context.map(torch.clone), batch.targets.map(torch.clone)
         self._shapes = owner.simulator.encoder.static_shapes(batch.context, particles)
+        self._noise = None if batch.noise is None else batch.noise.clone()
         self._n_future, self._cut, self._weights = batch.n_future, batch.cut, weights.clone()
 
     def __call__(self, prepared: Prepared, weights: Tensor, report: StabilityReport) -> Gradients:
@@ -284,6 +285,7 @@ class _Step:
             state, plan = _without_background(state), of_prepared_state(plan)
         else:
             state = owner.simulator._prepare(state, plan)
+        state = displaced(state, self._noise, owner.simulator.config.dynamics.grid_size)
         rollout = partial(owner.simulator.rollout, plan=plan, geometry=geometry, report=report, on_invalid="drop")
         with owner.precision("dynamics"):
             return in_segments(partial(rollout, wrap=wrap), state, self._n_future, self._cut)
@@ -368,6 +370,8 @@ class _Step:
         self._shapes.copy_(prepared.shapes)
         self._weights.copy_(weights)
         batch = prepared.batch
+        if batch.noise is not None:
+            self._noise.copy_(batch.noise)
         for own, given in ((self._context, batch.context), (self._targets, batch.targets)):
             _copy(own, given)
 

@@ -79,6 +79,9 @@ class DataConfig:
         unfrozen_background: largest fraction, 0 to 1, of a scene's background that is presented to the dynamics as
             movable, drawn per scene and in cubes; augmentation for models with an asymmetric background, whose
             particles at rest may be awake or asleep.
+        position_noise: standard deviation in metres along each axis of a displacement of the movable particles of each
+            encoded step before simulation, smooth in space; training noise that the network learns to correct, as in
+            graph network simulators. Evaluation and the images of the encoded steps have none.
         resize: (width, height) in pixels: images are resized to cover it and centre-cropped; empty: as recorded.
         near_far: depth range of all scenes in metres; empty: each scene's own.
         targets_apart: draw targets only from cameras that are not an input of the window. Otherwise a model can overfit
@@ -98,6 +101,7 @@ class DataConfig:
     background_stride: int = 1
     body_stride: int = 1
     unfrozen_background: float = 0.0
+    position_noise: float = 0.0
     resize: tuple[int, ...] = ()
     near_far: tuple[float, ...] = ()
     targets_apart: bool = False
@@ -111,7 +115,7 @@ class DataConfig:
         check_ranges(self, history=(1, 10**5), shortest_history=(0, 10**5), unfrozen_background=(0, 1))
         check_ranges(self, context_views=(1, 10**4), fewest_views=(0, 10**4))
         check_ranges(self, background_stride=(1, LARGEST_SIDE), body_stride=(1, LARGEST_SIDE))
-        check_ranges(self, subsample_fps=(0, 1e6))
+        check_ranges(self, subsample_fps=(0, 1e6), position_noise=(0, 1e6))
         if self.leave_one_out and (min(self.fewest_views or 2, self.context_views) < 2 or self.targets_apart):
             raise InputError("data.leave_one_out: needs two input views or more, and targets_apart: false")
         for least, most in (("shortest_history", "history"), ("fewest_views", "context_views")):

@@ -57,7 +57,7 @@ from gsim3d.train.losses import time_weights, training_loss
 from gsim3d.train.optimizer import FIRST_SCALE, LossScale, Optimizer, deterministic, one_cycle, update_average
 from gsim3d.train.processes import Processes
 from gsim3d.train.restore import build_simulator, describe, keep_jacobian, model_config
-from gsim3d.train.samples import Batch, BatchReader, check_scenes, draw_batch, history_at, unfreeze
+from gsim3d.train.samples import Batch, BatchReader, check_scenes, displaced, draw_batch, history_at, unfreeze
 from gsim3d.train.stopping import noted_signals
 
 EMA_WARM_UP = 10  # the decay of the average is at most (1 + step) / (EMA_WARM_UP + step)
@@ -423,6 +423,7 @@ class Trainer:
                 particles = unfreeze(particles, self.config.data.unfrozen_background, self.effects, rng)
             with precision.of("dynamics", self.device):
                 begin = simulator._prepare(particles, self.plan)
+                begin = displaced(begin, batch.noise, simulator.config.dynamics.grid_size)
                 given = {"plan": self.plan, "generator": noise, "wrap": again("steps", noise), **options}
                 steps = in_segments(partial(simulator.rollout, **given), begin, batch.n_future, batch.cut)
             if self._is_logged:

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -16,9 +17,11 @@ from gsim3d.data import Scene, Window, generator, make_frames
 from gsim3d.data.fitting import frame_stride
 from gsim3d.effects.spec import EffectsSpec, Sleep
 from gsim3d.errors import InputError
-from gsim3d.state import DYNAMIC, FROZEN, Particles
+from gsim3d.priors.position_waves import relative_positions
+from gsim3d.state import DYNAMIC, FROZEN, Particles, split_rows
 from gsim3d.train.config import DataConfig, PhaseConfig
 
+WAVES, WAVELENGTHS = 16, (4.0, 64.0)  # of position noise, in cells
 READERS = 2  # threads that read batches, and number of batches read ahead
 
 
@@ -32,6 +35,7 @@ class Batch:
         n_context: number of encoded steps.
         n_future: number of simulated steps.
         cut: see :class:`gsim3d.train.config.PhaseConfig`.
+        noise: result of :func:`draw_noise`.
     """
 
     context: Frames
@@ -39,9 +43,11 @@ class Batch:
     n_context: int
     n_future: int
     cut: int = 0
+    noise: Tensor | None = None
 
     def to(self, device: str | torch.device) -> Batch:
-        return dataclasses.replace(self, context=self.context.to(device), targets=self.targets.to(device))
+        noise = None if self.noise is None else self.noise.to(device)
+        return dataclasses.replace(self, context=self.context.to(device), targets=self.targets.to(device), noise=noise)
 
     def target_step(self) -> Tensor:
         """Returns int64 [I], the step in its window of each target image."""
@@ -126,7 +132,8 @@ def draw_batch(
     if context.actions is not None:  # of the window, so that all batches have the same shape
         actions = context.actions.between((0,) * len(chosen), n_context + phase.horizon)
         context = dataclasses.replace(context, actions=actions)
-    return Batch(subsampled(context, data), targets, n_context, phase.horizon, phase.cut)
+    noise = draw_noise(data, n_context, seed, step, samples)
+    return Batch(subsampled(context, data), targets, n_context, phase.horizon, phase.cut, noise)
 
 
 def draw_windows(
@@ -178,6 +185,40 @@ def spread_views(cameras: Sequence[int], count: int, turn: int) -> tuple[int, ..
 def subsampled(frames: Frames, data: DataConfig) -> Frames:
     """Returns ``frames`` with masks subsampled by the strides of ``data``."""
     return frames.subsample(data.background_stride, data.body_stride)
+
+
+def draw_noise(data: DataConfig, n_context: int, seed: int, step: int, samples: Sequence[int]) -> Tensor | None:
+    """Draws ``data.position_noise`` of all encoded clouds; None: there is none.
+
+    Returns:
+        float64 [Q, WAVES, 7], Q clouds: for each wave the phase's gradient in 1 / cell, the phase, and the amplitude
+        along each axis in metres.
+    """
+    if not data.position_noise:
+        return None
+    clouds = []
+    for sample in samples:
+        rng = generator(seed, step, sample, "position noise")
+        along, moved = rng.standard_normal((2, n_context, WAVES, 3))
+        length, phase = rng.uniform(*np.log(WAVELENGTHS), (n_context, WAVES, 1)), rng.random((n_context, WAVES, 1))
+        along *= 2 * np.pi / np.exp(length) / np.linalg.norm(along, axis=-1, keepdims=True)
+        moved *= data.position_noise * (2 / WAVES) ** 0.5
+        clouds.append(np.concatenate([along, 2 * np.pi * phase, moved], -1))
+    return torch.from_numpy(np.concatenate(clouds))
+
+
+def displaced(particles: Particles, noise: Tensor | None, cell: float) -> Particles:
+    """Displaces the movable particles of each cloud by the waves of :func:`draw_noise`, for cells of ``cell`` metres.
+
+    Neighbours move together, as with the errors of a network: the mean of independent displacements would vanish.
+    """
+    if noise is None:
+        return particles
+    starts, places = particles.clouds.starts, relative_positions(particles).detach() / cell
+    parts = zip(split_rows(places, list(pairwise(starts))), noise, strict=True)
+    moved = torch.cat([(part @ waves[:, :3].T + waves[:, 3]).sin() @ waves[:, 4:] for part, waves in parts])
+    moved = torch.where((particles.activity == DYNAMIC)[:, None], moved.to(particles.means), 0)
+    return dataclasses.replace(particles, means=particles.means + moved)
 
 
 def unfreeze(particles: Particles, most: float, spec: EffectsSpec, rng: np.random.Generator) -> Particles:

@@ -39,7 +39,7 @@ STATES = Path(curve.__file__).parent / "state"
 OPTIONS = {"image_size": 32, "n_frames": 6, "objects": ("ball",), "n_trajectories": 2}
 CONFIG = TrainConfig(
     phases=(PhaseConfig(steps=2, history=1, batch=2, target_views=2), PhaseConfig(steps=98, horizon=2, target_views=2)),
-    data=DataConfig(history=2, context_views=2, target_only_cameras=(2, 7), background_stride=2),
+    data=DataConfig(history=2, context_views=2, target_only_cameras=(2, 7), background_stride=2, position_noise=0.003),
     log_every=1,
 )
 
@@ -74,6 +74,7 @@ def test_store_batches_equal_those_of_scene_folders(world, spread, tmp_path):
     for step, phase in enumerate((CONFIG.phases[0], dataclasses.replace(CONFIG.phases[1], batch=3))):
         given = store.draw(CONFIG.data, phase, 5, step, range(3))
         wanted = draw_batch(scenes, CONFIG.data, phase, 5, step, range(3))
+        assert torch.equal(given.noise, wanted.noise)
         assert (given.n_context, given.n_future) == (wanted.n_context, wanted.n_future)
         assert len(given.targets.images) == len(given.target_step()) == 3 * 2 * (given.n_context + given.n_future)
         for part in ("context", "targets"):

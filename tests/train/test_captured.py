@@ -27,7 +27,7 @@ ROWS = load_ablations()[1]
 
 CONFIG = TrainConfig(
     phases=(PhaseConfig(steps=9, horizon=2, batch=2, target_views=2),),
-    data=DataConfig(history=2, context_views=2, background_stride=2),
+    data=DataConfig(history=2, context_views=2, background_stride=2, position_noise=0.005),
 )
 
 

@@ -15,14 +15,16 @@ from gsim3d.data import Scene
 from gsim3d.errors import InputError
 from gsim3d.io import checkpoint
 from gsim3d.io.settings import from_dict
+from gsim3d.state import DYNAMIC, FROZEN
 from gsim3d.train.config import DataConfig, PhaseConfig, PrecisionConfig
 from gsim3d.train.gradients import StepWatch
 from gsim3d.train.log import sample_video
 from gsim3d.train.loop import Trainer, deterministic
 from gsim3d.train.optimizer import STEPS_TO_DOUBLE, LossScale
-from gsim3d.train.samples import draw_batch, draw_windows
+from gsim3d.train.samples import displaced, draw_batch, draw_noise, draw_windows
 from gsim3d.viewer import training
 from gsim3d.viewer.training import showing_samples
+from tests.dynamics.scenes import TINY, make_history
 from tests.tiny_scenes import write_scenes
 from tests.train.test_loop import CONFIG, curve, scenes
 
@@ -284,6 +286,36 @@ def test_windows_begin_within_the_first_steps(within, starts):
     assert drawn == set(range(starts))
     always = dataclasses.replace(phase, from_start=1.0)
     assert draw_windows([Long()], DataConfig(context_views=2), always, 0, 3, [0])[0].steps[0] == 0
+
+
+def test_position_noise_moves_bodies_smoothly():
+    data, state = DataConfig(position_noise=0.01), make_history((2000, 2000))
+    assert draw_noise(DataConfig(), 2, 0, 0, [0]) is None and displaced(state, None, 1.0) is state
+    pairs = torch.cdist(state.means[:2000], state.means[:2000])
+    near, far = (((pairs > low) & (pairs < high)).nonzero()[::97] for low, high in ((0, 0.02), (0.4, 1)))
+    moved, apart = [], {0.02: [], 0.4: []}
+    for step in range(30):
+        noise = draw_noise(data, 2, 7, step, [3])
+        assert torch.equal(draw_noise(data, 2, 7, step, [1, 3])[2:], noise)
+        offsets = displaced(state, noise, TINY.grid_size).means - state.means
+        assert not offsets[state.activity == FROZEN].any()
+        moves = state.activity == DYNAMIC
+        moved.append(offsets[moves])
+        for name, (a, b) in zip(apart, (near.T, far.T), strict=True):
+            both = moves[a] & moves[b]
+            apart[name].append((offsets[a] - offsets[b])[both].square().mean())
+    deviations = torch.cat(moved).square().mean(0).sqrt()
+    assert ((deviations / 0.01 - 1).abs() < 0.25).all(), deviations
+    assert sum(apart[0.02]) < 0.05 * sum(apart[0.4])
+
+
+def test_position_noise_changes_simulated_steps_in_training_alone(folder, tmp_path):
+    config = dataclasses.replace(CONFIG, data=dataclasses.replace(CONFIG.data, position_noise=0.05))
+    trainer = Trainer(config, scenes(folder), tmp_path)
+    batch = draw_batch(trainer.scenes, config.data, CONFIG.phases[1], 0, 0, [0])
+    (_, noisy), (_, clean) = trainer.loss(batch), trainer.loss(dataclasses.replace(batch, noise=None))
+    n = batch.n_context
+    assert torch.equal(noisy[:n], clean[:n]) and (noisy[n:] != clean[n:]).all()
 
 
 def test_cut_bounds_steps_of_gradients(folder, tmp_path):

@@ -26,7 +26,7 @@ from gsim3d.synth.run import start_data_worker, write_trajectory
 from gsim3d.synth.world import World
 from gsim3d.train.config import DataConfig, PhaseConfig
 from gsim3d.train.processes import Processes
-from gsim3d.train.samples import Batch, draw_windows, subsampled
+from gsim3d.train.samples import Batch, draw_noise, draw_windows, subsampled
 
 QUEUED = 2  # trajectories that wait for each data worker
 
@@ -122,7 +122,9 @@ class TrajectoryStore:
             context = frames([window.context_cams for window in windows], range(n_context))
             targets = frames([window.target_cams for window in windows], range(n_context + phase.horizon))
             context = dataclasses.replace(context, actions=self._acting(windows))
-        return Batch(subsampled(context, data), targets, n_context, phase.horizon, phase.cut)
+        noise = draw_noise(data, n_context, seed, step, samples)
+        batch = Batch(subsampled(context, data), targets, n_context, phase.horizon, phase.cut, noise)
+        return batch.to(self.device)
 
     def _acting(self, windows: Sequence[Window]) -> Actions | None:
         """The actions of the windows; None: the world has no actors."""
