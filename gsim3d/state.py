@@ -212,12 +212,12 @@ class Actions(TensorRecord):
 
     A model with action particles (``model.dynamics.actions``) reads them if the plan has ``dynamics.actions`` on: to
     predict step t + 1, it receives the positions at t and the displacements to t + 1. A point rests before its first
-    and after its last given step.
+    and after its last given step, and before it vanishes.
 
     Attributes:
         positions: float [B, T, A, 3] metres, world, finite; entry i of scene b is at step ``first[b] + i``. Gradients
             flow to it.
-        types: int64 [B, A], index into ``names``; -1: the scene has no such point.
+        types: int64 [B, T, A], index into ``names``; -1: the scene has no such point at that step.
         names: names of the types of points.
         first: step of the first position of each scene; empty: 0.
     """
@@ -248,27 +248,28 @@ class Actions(TensorRecord):
             raise InputError(f"actions: positions of scene {scene}, step {step} must be finite")
         names = tuple(dict.fromkeys(types))
         index = torch.tensor([names.index(name) for name in types], device=positions.device)
-        return cls(positions, index.expand(len(positions), -1), names)
+        return cls(positions, index.expand(*positions.shape[:2], -1), names)
 
     @property
     def n_points(self) -> int:
         """Largest number of points of a scene, A."""
         return self.positions.shape[2]
 
-    def at(self, clouds: CloudTable, later: int = 0) -> Tensor:
-        """Returns positions [Q, A, 3], ``later`` steps after the step of each of ``clouds``. Needs no device sync."""
+    def at(self, clouds: CloudTable, later: int = 0) -> tuple[Tensor, Tensor]:
+        """Returns positions [Q, A, 3] and types [Q, A], ``later`` steps after those of ``clouds``, without a sync."""
         first, n_steps, device = self.first or (0,) * len(self.types), self.positions.shape[1], self.positions.device
         given = zip(clouds.scenes, clouds.steps, strict=True)
         steps = tuple(min(max(step + later - first[scene], 0), n_steps - 1) for scene, step in given)
-        return self.positions[constant(clouds.scenes, device), constant(steps, device)]
+        entries = constant(clouds.scenes, device), constant(steps, device)
+        return self.positions[entries], self.types[entries]
 
     def between(self, first: Sequence[int], n_steps: int) -> Actions:
         """Returns the ``n_steps`` steps of each scene from its step in ``first``."""
         scenes = [scene for scene in range(len(first)) for _ in range(n_steps)]
         steps = [begin + step for begin in first for step in range(n_steps)]
         table = CloudTable.make((0 for _ in scenes), scenes, steps, self.positions.device)
-        positions = self.at(table).unflatten(0, (len(first), n_steps))
-        return dataclasses.replace(self, positions=positions, first=tuple(first))
+        positions, types = (value.unflatten(0, (len(first), n_steps)) for value in self.at(table))
+        return dataclasses.replace(self, positions=positions, types=types, first=tuple(first))
 
     def select(self, scenes: Sequence[int]) -> Actions:
         """Returns the actions of ``scenes``, in their order."""

@@ -43,7 +43,7 @@ def read_actions(folder: Path, n_steps: int, problems: Problems) -> RecordedActi
     if problem is not None:
         problems.add(f"{file}: {problem}")
         return None
-    return RecordedActions(positions.astype(np.float64), tuple(str(name) for name in types))
+    return RecordedActions(positions.astype(np.float64), tuple(map(str, types)), np.ones(positions.shape[:2], bool))
 
 
 def _arrays(content: bytes) -> tuple[np.ndarray, np.ndarray]:

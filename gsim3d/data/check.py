@@ -252,7 +252,8 @@ def _draw_scene(tile: np.ndarray, scene: Scene, cam: int, step: int, zoom: float
         if end is not None:
             _write(tile, name, (end + 2).tolist(), color)
     if scene.recording.actions is not None:
-        pixels, depth = project(scene.recording.actions.positions[step], viewmat, K)
+        actions = scene.recording.actions
+        pixels, depth = project(actions.positions[step][actions.present[step]], viewmat, K)
         for pixel in pixels[depth > 1e-3].clip(-MAX_COORDINATE, MAX_COORDINATE).round().astype(int):
             cv2.circle(tile, pixel.tolist(), 2, ACTOR, -1, cv2.LINE_AA)
     centres, _ = positions_and_axes(viewmats)

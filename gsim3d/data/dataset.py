@@ -122,12 +122,13 @@ def _join_actions(scenes: Sequence[Scene], steps_per_scene: Sequence) -> Actions
     names = tuple(sorted({name for actions in known for name in actions.types}))
     steps = [[*map(int, s), *range(int(s[-1]) + 1, scene.n_steps)] for s, scene in zip(steps_per_scene, scenes)]
     shape = len(scenes), max(map(len, steps)), max(len(actions.types) for actions in known)
-    positions, types = torch.zeros(*shape, 3), torch.full((shape[0], shape[2]), -1)
+    positions, types = torch.zeros(*shape, 3), torch.full(shape, -1)
     for number, actions in enumerate(recorded):
         if actions is not None:
             at = steps[number] + [steps[number][-1]] * (shape[1] - len(steps[number]))
             positions[number, :, : len(actions.types)] = torch.from_numpy(actions.positions[at])
-            types[number, : len(actions.types)] = torch.tensor([names.index(name) for name in actions.types])
+            given = torch.tensor([names.index(name) for name in actions.types])
+            types[number, :, : len(given)] = torch.where(torch.from_numpy(actions.present[at]), given, -1)
     return Actions(positions, types, names)
 
 

@@ -49,7 +49,7 @@ def resample(recording: Recording, fps: float) -> Recording:
         Ks=Ks,
         read_images=strided(recording.read_images),
         read_labels=None if recording.read_labels is None else strided(recording.read_labels),
-        actions=recording.changed_actions(lambda positions: positions[::stride]),
+        actions=recording.actions and recording.actions.every(stride),
     )
 
 

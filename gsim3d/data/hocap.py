@@ -102,7 +102,7 @@ def hand_keypoints(folder: str | Path, problems: Problems | None = None) -> tupl
 def _actions(
     positions: np.ndarray, valid: np.ndarray, types: Sequence[str], notes: list[str]
 ) -> RecordedActions | None:
-    """Returns the joints that are ever known, held at the nearest known position elsewhere; adds notes."""
+    """Returns the joints that are ever known, absent in long gaps (positions there: the nearest known); adds notes."""
     points, held = np.flatnonzero(valid.any(0)), positions.astype(np.float64)
     for point in points:
         known = np.flatnonzero(valid[:, point])
@@ -110,8 +110,9 @@ def _actions(
     for side in SIDES:
         absent = max((int((~valid[:, point]).sum()) for point in points if types[point].startswith(side)), default=0)
         if absent:
-            notes.append(f"{side} hand: absent at {absent} of {len(valid)} frames, held where it was last or next")
-    return RecordedActions(held[:, points], tuple(types[point] for point in points)) if len(points) else None
+            notes.append(f"{side} hand: absent at {absent} of {len(valid)} frames")
+    names = tuple(types[point] for point in points)
+    return RecordedActions(held[:, points], names, valid[:, points]) if len(points) else None
 
 
 def _depths(viewmats: np.ndarray) -> tuple[float, float]:

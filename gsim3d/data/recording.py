@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -63,10 +64,16 @@ class RecordedActions:
     Attributes:
         positions: float64 [T, A, 3] metres.
         types: type of each point.
+        present: bool [T, A], where a point is.
     """
 
     positions: np.ndarray
     types: tuple[str, ...]
+    present: np.ndarray
+
+    def every(self, stride: int) -> RecordedActions:
+        """Returns the actions at every ``stride``-th step."""
+        return RecordedActions(self.positions[::stride], self.types, self.present[::stride])
 
 
 @dataclass(frozen=True)
@@ -148,8 +155,7 @@ class Recording:
 
     def changed_actions(self, change: Callable[[np.ndarray], np.ndarray]) -> RecordedActions | None:
         """Returns ``actions`` with positions changed by a function."""
-        actions = self.actions
-        return actions and RecordedActions(change(actions.positions), actions.types)
+        return self.actions and dataclasses.replace(self.actions, positions=change(self.actions.positions))
 
     def cameras_at_step(self, step: int) -> tuple[np.ndarray, np.ndarray]:
         """Returns viewmats [V, 4, 4] and Ks [V, 3, 3] of a step."""

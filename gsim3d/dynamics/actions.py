@@ -80,11 +80,13 @@ class ActionParticles(nn.Module):
         return step.with_clouds(CloudTable.make(counts, table.scenes, table.steps, step.cu_rows.device), **fields)
 
     def _points(self, history: Particles, acting: tuple[str, ...]) -> Particles:
-        """The action particles of all clouds; those that a scene does not have are asleep."""
+        """The action particles of all clouds; those that a scene does not have there are asleep."""
         actions, table, like = history.actions, history.clouds, history.means
-        types = self._types(actions, acting)[constant(table.scenes, like.device)]
-        now = actions.at(table).to(like)
-        moved = ((actions.at(table, 1).to(like) - now) / self.cell)[..., None]
+        index = self._index(actions, acting)
+        (now, types), (coming, coming_types) = actions.at(table), actions.at(table, 1)
+        now, types = now.to(like), index[types]
+        stays = (coming_types < 0)[..., None]
+        moved = (torch.where(stays, 0, coming.to(like) - now) / self.cell)[..., None]
         latents = self.embedding[types.clamp_min(0)] + (moved * self.displacement).sum(-2)
         latents = latents.flatten(0, 1).to(history.dynamic_latents)
         counts = CloudTable.make((actions.n_points,) * len(table), table.scenes, table.steps, history.cu_rows.device)
@@ -102,11 +104,11 @@ class ActionParticles(nn.Module):
             known=counts,
         )
 
-    def _types(self, actions: Actions, acting: tuple[str, ...]) -> Tensor:
-        """int64 [B, A]: index into ``types`` of each point; -1: not there, or not acting."""
+    def _index(self, actions: Actions, acting: tuple[str, ...]) -> Tensor:
+        """int64: index into ``types`` of each of the actions' types; -1 (also its last entry): not acting."""
         if unknown := [name for name in actions.names if name not in self.types]:
             raise InputError(
                 f"actions: the model does not know the type {unknown[0]!r}; it has {', '.join(self.types)}"
             )
         index = tuple(self.types.index(name) if name in acting else -1 for name in actions.names)
-        return constant((*index, -1), actions.types.device)[actions.types]  # -1 reads the last entry
+        return constant((*index, -1), actions.types.device)  # a type of -1 reads the last entry

@@ -171,10 +171,10 @@ class ModelScenes(Scenes):
 
     def _acted(self, before: Particles, path: Tensor) -> Particles:
         """The step that follows with action particles on ``path`` [n, L + 1, A, 3]."""
-        table, n_points = before.clouds, path.shape[2]
+        table = before.clouds
         newest = {table.scenes[q]: table.steps[q] for q in newest_clouds(table)}
         first = tuple(newest[scene] + 2 - path.shape[1] for scene in range(self.count))
-        types = torch.zeros(self.count, n_points, dtype=torch.int64, device=self.device)
+        types = torch.zeros(path.shape[:3], dtype=torch.int64, device=self.device)
         acting = dataclasses.replace(before, actions=Actions(path.float(), types, (self._type,), first))
         return dataclasses.replace(self.simulator.rollout(acting, 1, self.plan, wrap=self._wrap)[0], actions=None)
 

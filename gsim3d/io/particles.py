@@ -85,8 +85,10 @@ def _actions(about: dict, tensors: dict[str, Tensor]) -> Actions | None:
         return None
     (names, first), (positions, types) = about["actions"], (tensors.pop(f"actions.{name}") for name in ACTIONS)
     names, first = tuple(map(str, names)), tuple(map(int, first))
-    wanted = (1, positions.shape[1], types.shape[1], 3) if positions.dim() == 4 and types.dim() == 2 else ()
-    if tuple(positions.shape) != wanted or not bool(positions.isfinite().all()) or 0 in wanted or len(first) > 1:
+    if types.dim() == 2:  # written when points were there at all steps
+        types = types[:, None].expand(-1, positions.shape[1], -1)
+    fits = types.dim() == 3 and positions.shape == (1, *types.shape[1:], 3) and positions.numel() > 0
+    if not fits or not bool(positions.isfinite().all()) or len(first) > 1:
         raise ValueError("positions of actions are damaged")
     if types.dtype != torch.int64 or not bool(((types >= -1) & (types < len(names))).all()):
         raise ValueError("types of actions are damaged")

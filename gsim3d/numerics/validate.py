@@ -208,11 +208,11 @@ def check_particles(particles: Particles, where: str, dtype: torch.dtype, widths
 def _check_actions(particles: Particles, where: str) -> None:
     positions, types = particles.actions.positions, particles.actions.types
     n_scenes, device = len(particles.origin), particles.means.device
-    fits = positions.shape == (n_scenes, *positions.shape[1:2], *types.shape[1:], 3) and len(types) == n_scenes
+    fits = positions.shape == (n_scenes, *types.shape[1:], 3) and types.dim() == 3 and len(types) == n_scenes
     if not fits or {positions.device, types.device} != {device}:
         got = f"{list(positions.shape)} and {list(types.shape)} on {positions.device}"
         raise InputError(
-            f"{where}: particles.actions must have positions [{n_scenes}, T, A, 3] and types [{n_scenes}, A] "
+            f"{where}: particles.actions must have positions [{n_scenes}, T, A, 3] and types [{n_scenes}, T, A] "
             f"on {device}; got {got}"
         )
 

@@ -79,13 +79,18 @@ def test_joints_are_world_positions_with_short_gaps_interpolated(folder):
     assert not valid[20:27, 21:].any() and (positions[20:27, 21:] == 0).all()
 
 
-def test_actions_are_the_joints_held_in_long_gaps(scene, tmp_path):
+def test_actions_are_the_joints_absent_in_long_gaps(scene, tmp_path):
     actions = scene.recording.actions
     assert actions.types == tuple(TYPES)
     assert any("left hand: absent at 7 of 32 frames" in note for note in scene.recording.notes)
     assert not any("right hand" in note for note in scene.recording.notes)
-    np.testing.assert_allclose(actions.positions[20:23, 21:], np.stack([hand("left", 19)] * 3), atol=1e-5)
-    np.testing.assert_allclose(actions.positions[24:27, 21:], np.stack([hand("left", 27)] * 3), atol=1e-5)
+    assert actions.present[:, :21].all() and not actions.present[20:27, 21:].any()
+    assert actions.present[:20].all() and actions.present[27:].all()
+    halved = Scene.open(scene.path, fps=15).recording.actions
+    np.testing.assert_array_equal(halved.present, actions.present[::2])
+    types = make_frames([scene], [[0]], [[18, 19]]).actions.types
+    assert types.shape == (1, 14, 42) and (types[0, 2:9, 21:] == -1).all() and (types[0, :2] >= 0).all()
+    assert (types[0, :, :21] >= 0).all() and (types[0, 9:] >= 0).all()
     whole = Scene.open(write_hocap(tmp_path, gaps=False, n_frames=8), fps=15)
     assert len(whole.recording.actions.types) == 42
     for step in range(4):  # frames 0, 2, 4, 6

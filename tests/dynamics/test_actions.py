@@ -127,11 +127,26 @@ def test_later_positions_change_no_earlier_step():
     assert not torch.equal(first[2].means, second[2].means)
 
 
+def test_absent_points_have_no_influence():
+    """A point that vanishes rests before; while it is away its positions count for nothing."""
+    simulator, state, actions = setting()
+    types = actions.types.clone()
+    types[:, 3:5, 1] = -1
+    steps = [rollout(simulator, given(state, dataclasses.replace(actions, types=types)))]
+    moved = actions.positions.clone()
+    moved[:, 3:5, 1] += 5.0
+    steps.append(rollout(simulator, given(state, dataclasses.replace(actions, types=types, positions=moved))))
+    assert_same_steps(*steps)
+    there = rollout(simulator, given(state, actions))
+    assert_same_steps(steps[0][:1], there[:1])  # step 2, from positions up to step 2
+    assert not torch.equal(steps[0][1].means, there[1].means)
+
+
 def test_order_of_points_does_not_count():
     simulator, state, actions = setting()
-    swapped = dataclasses.replace(actions, positions=actions.positions.flip(2), types=actions.types.flip(1))
+    swapped = dataclasses.replace(actions, positions=actions.positions.flip(2), types=actions.types.flip(2))
     assert_same_steps(rollout(simulator, given(state, actions)), rollout(simulator, given(state, swapped)))
-    types = dataclasses.replace(actions, types=actions.types.flip(1))
+    types = dataclasses.replace(actions, types=actions.types.flip(2))
     assert not torch.equal(
         rollout(simulator, given(state, actions))[0].means, rollout(simulator, given(state, types))[0].means
     )
@@ -141,7 +156,7 @@ def test_order_of_points_does_not_count():
 def test_scenes_of_a_batch_equal_those_alone(name):
     """The second scene has one point, the first has two."""
     simulator, state, actions = setting(CONFIGS[name], (2, 2))
-    actions = dataclasses.replace(actions, types=torch.tensor([[1, 0], [0, -1]]), names=TYPES)
+    actions = dataclasses.replace(actions, types=torch.tensor([[1, 0], [0, -1]])[:, None].expand(2, 8, 2), names=TYPES)
     together = rollout(simulator, given(state, actions))
     frames = make_frames((2, 2))
     for scene in range(2):
@@ -185,9 +200,9 @@ def test_captured_rollouts_read_the_actions_of_each_call(name):
 def test_points_rest_outside_of_their_steps():
     _, state, actions = setting()
     table = state.clouds.ahead(20)
-    assert_same_bits(actions.at(table), actions.positions[:, -1].expand(2, -1, -1))
-    assert_same_bits(actions.between([3], 2).at(state.clouds.ahead(3)), actions.positions[0, 3:5])
-    assert_same_bits(actions.between([3], 2).at(state.clouds), actions.positions[0, [3, 3]])
+    assert_same_bits(actions.at(table)[0], actions.positions[:, -1].expand(2, -1, -1))
+    assert_same_bits(actions.between([3], 2).at(state.clouds.ahead(3))[0], actions.positions[0, 3:5])
+    assert_same_bits(actions.between([3], 2).at(state.clouds)[0], actions.positions[0, [3, 3]])
 
 
 def test_plan_shows_actions_with_their_cost_and_refuses_unknown_types():

@@ -132,7 +132,8 @@ class TrajectoryStore:
             return None
         slots = torch.tensor([window.scene.slot for window in windows], device=self.device)
         steps = torch.tensor([window.steps for window in windows], device=self.device)
-        return Actions(self._actions[slots[:, None], steps], self._types[slots], self._names)
+        positions, types = self._actions[slots[:, None], steps], self._types[slots, None].expand(*steps.shape, -1)
+        return Actions(positions, types, self._names)
 
     def _frames(self, windows: Sequence[Window], depths: tuple[float, float], cams: Sequence, steps: range) -> Frames:
         """Some steps of the windows, seen by the cameras of each step."""
