@@ -45,6 +45,7 @@ RINGS = {
         evaluate envs
         testing
         profile capture
+        reproduce
     """,
     "commands": """
         cli.arguments

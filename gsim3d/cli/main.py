@@ -29,6 +29,7 @@ COMMANDS = {
     "evaluate": ("gsim3d.cli.evaluate", "measure predictions on a data set, beside baselines and other models"),
     "profile": ("gsim3d.cli.profile", "what accuracy costs in time: a report, and settings that keep a promise"),
     "ablate": ("gsim3d.cli.ablate", "the paper's ablations: the same training with one change, in one table"),
+    "reproduce": ("gsim3d.cli.reproduce", "the paper's tables and figures with models at hand, on one page"),
     "weights": ("gsim3d.cli.weights", "install the weights of LPIPS and FVD"),
     "import": ("gsim3d.cli.import_released", "convert a checkpoint of the authors' release: the same predictions"),
     "demo": ("gsim3d.cli.demo", "all of it at a small size, in minutes on a CPU"),

@@ -176,7 +176,7 @@ def write_overview(
     heads["the future, from a camera never seen"] = 0.72
     for text, x in heads.items():
         figure.text(x, 0.94, text, ha="center", fontsize=12)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def write_curves(path: str | Path, summary: dict, fps: float | None, metrics: Sequence[str] = tuple(METRICS)) -> None:
@@ -214,7 +214,7 @@ def write_curves(path: str | Path, summary: dict, fps: float | None, metrics: Se
     for axes in panels.flat[len(drawn) :]:
         axes.remove()
     max(panels.flat[: len(drawn)], key=lambda axes: len(axes.lines)).legend(fontsize=8)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def pyplot():
@@ -227,7 +227,8 @@ def pyplot():
     return importlib.import_module("matplotlib.pyplot")
 
 
-def _save(figure, path: str | Path) -> None:
+def save_figure(figure, path: str | Path) -> None:
+    """Writes a figure of matplotlib as PNG, atomically, and closes it."""
     with whole_file(path) as part:
         figure.savefig(part, dpi=110)
     pyplot().close(figure)

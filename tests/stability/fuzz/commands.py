@@ -41,6 +41,7 @@ RIGHT = {
     "effects": "infer {good}/data/ball/0000 {good}/model.safetensors --out {out}.yaml",
     "profile": "{good}/model.safetensors {good}/data --out {out} --quiet",
     "ablate": "{good}/data --rows latent --config {good}/train.yaml --out {out} --quiet",
+    "reproduce": "{good}/model.safetensors --data {good}/data --out {out} --steps 1 --budget 0.01",
     "evaluate": "{good}/model.safetensors {good}/data --out {out} --steps 1",
     "weights": "lpips --from {good}/train.yaml",
     "import": "{good}/model.safetensors --config {good}/train.yaml --out {out}",

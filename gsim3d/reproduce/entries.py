@@ -1,0 +1,199 @@
+"""The rows of the page: what each needs, how it is measured, and what the paper reports."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from gsim3d.baselines import baseline
+from gsim3d.data import Scene
+from gsim3d.effects.edits import Duplicate, Edit, Operation, Remove, Throw, structure_of
+from gsim3d.errors import InputError
+from gsim3d.evaluate.pictures import as_bytes, pyplot, save_figure, true_images
+from gsim3d.evaluate.protocol import default_views, horizon, predict, render_steps, score_scene
+from gsim3d.evaluate.scoring import PLAIN_METRICS, measurable
+from gsim3d.io.files import with_parents
+from gsim3d.numerics.speed import Setting
+from gsim3d.profile.settings import Runner
+from gsim3d.profile.sweep import BenchmarkCase, Stepping
+from gsim3d.profile.timing import DeviceClock, time_call
+from gsim3d.reproduce.cells import to_json
+from gsim3d.train.restore import Restored
+
+GIVEN = 4  # input steps of every method, as published
+MAIN, HISTORY, CAMERAS, SPEED, EDITS, TRAINED = (
+    "Main table",
+    "History length at inference",
+    "Input cameras at inference",
+    "Speed",
+    "Edits",
+    "Ablations",
+)
+REPEATS = 3  # timed calls
+EDIT_STEPS, SHOWN = 40, 6  # predicted steps of the edits, and how many of them are shown
+EDITED: dict[str, Operation | None] = {
+    "as it is": None,
+    "thrown up": Throw("moving", (0.0, 0.0, 0.06)),
+    "duplicated": Duplicate("moving", (0.0, 0.7, 0.2)),
+    "ground removed": Remove("frozen"),
+}
+METHODS = ("constant", "copy", "constant_velocity")  # baselines that the first model's predictions include
+
+
+@dataclass(frozen=True)
+class Case:
+    """One model (or none) and one scene.
+
+    Attributes:
+        restored: the model; None for methods that are fitted to the scene.
+        folder: folder of the scene.
+        targets: cameras from which all methods are scored.
+        n_future: number of predicted steps; None: to the end of the scene.
+        figure: file of a picture.
+        device: "cpu" or "cuda".
+    """
+
+    restored: Restored | None
+    folder: Path
+    targets: Sequence[int]
+    n_future: int | None
+    figure: Path
+    device: str
+
+    def scene(self) -> Scene:
+        """Opens the scene. Raises InputError if the model scales its images: other rows are scored on the original."""
+        if self.restored is None:
+            return Scene.open(self.folder)
+        scene = self.restored.open_scene(self.folder)
+        if set(scene.recorded_sizes) != {(scene.width, scene.height)}:
+            raise InputError(f"{self.folder}: the model takes {scene.width}x{scene.height} pixels; generate that size")
+        return scene
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A row of a table.
+
+    Attributes:
+        table: title of the table.
+        row: name of the row; {model} is replaced by the model's name.
+        run: measures a case. Returns "scores" of :func:`gsim3d.reproduce.cells.to_json`, or "numbers" by column, and
+            perhaps "by_scene" (scene -> value that is compared) and "figure".
+        paper: world -> published value.
+        of_model: whether it is measured for each model, or once for each world.
+        first_only: whether it is measured on the first scene only.
+        device: device that it needs; None: any.
+    """
+
+    table: str
+    row: str
+    run: Callable[[Case], dict]
+    paper: Mapping[str, str] = field(default_factory=dict)
+    of_model: bool = True
+    first_only: bool = False
+    device: str | None = None
+
+
+def score(case: Case, methods: Sequence[str] = (), plain: bool = True, **setting) -> dict:
+    """Scores the model under a setting, on the steps after the first ``GIVEN``.
+
+    Args:
+        methods: baselines to score, too.
+        plain: leave out metrics that need weights.
+        setting: options of :class:`gsim3d.numerics.speed.Setting`.
+    """
+    trained = case.restored.data
+    if setting.get("history", 1) > trained.history or setting.get("context_views", 1) > trained.context_views:
+        raise InputError(f"the model was trained with {trained.history} input steps of {trained.context_views} cameras")
+    restored, scene = Runner(case.restored, Setting(**setting)).restored, case.scene()
+    start = GIVEN - restored.n_encoded
+    if start < 0:
+        raise InputError(f"the model needs {restored.n_encoded} input steps; all rows are given {GIVEN}")
+    context, targets = default_views(restored, scene, None, case.targets)
+    metrics = PLAIN_METRICS if plain else measurable()[0]
+    views = {"context_cams": context, "target_cams": targets, "n_future": horizon(scene, GIVEN, case.n_future)}
+    scores = score_scene(restored, scene, **views, metrics=metrics, methods=methods, start=start)
+    return {"scores": to_json(scores, GIVEN)}
+
+
+def fit(case: Case, name: str) -> dict:
+    """Scores a baseline of :data:`gsim3d.baselines.BASELINES`, fitted to the scene."""
+    scene, other = case.scene(), baseline(name, case.device)
+    n_future = horizon(scene, GIVEN, case.n_future)
+    other.check(scene, case.targets, GIVEN, n_future)
+    given = {"target_cams": case.targets, "n_encoded": GIVEN, "n_future": n_future, "metrics": measurable()[0]}
+    scores = score_scene(None, scene, **given, methods=(), others=[other])
+    return {"scores": to_json(scores, GIVEN)}
+
+
+def speed(case: Case) -> dict:
+    """Times the encoding, and a simulated step with its images; on a GPU the step is a CUDA graph."""
+    benchmark = BenchmarkCase(case.restored, [case.scene()], case.n_future)
+    clock, runner = DeviceClock(benchmark.device), benchmark.runner()
+    frames = benchmark.frames(runner, [0])
+    encoding = time_call(lambda: runner.encode(frames), clock, REPEATS)
+    stepping = Stepping(benchmark, Setting(captured=benchmark.device.type == "cuda"), clock)
+    step = time_call(stepping, clock, REPEATS).split_over(stepping.span).median
+    parameters = sum(value.numel() for value in case.restored.simulator.parameters())
+    times = {"encode_ms": 1e3 * encoding.median, "step_ms": 1e3 * step, "steps_a_second": 1 / step}
+    return {"numbers": {**times, "parameters": parameters}}
+
+
+def edit(case: Case) -> dict:
+    """Draws the true scene, and its predictions with the edits of EDITED, each from the first predicted step on."""
+    scene, cam = case.scene(), case.targets[:1]
+    n_given, n_future = case.restored.n_encoded, min(EDIT_STEPS, horizon(scene, GIVEN, case.n_future))
+    steps = np.linspace(n_given, n_given + n_future - 1, min(SHOWN, n_future)).round().astype(int).tolist()
+    rows = {"truth": true_images(scene, cam, steps)[:, 0]}
+    for name, operation in EDITED.items():
+        edits = () if operation is None else (Edit(0, operation),)
+        spec = dataclasses.replace(case.restored.plan.spec, structure=structure_of(edits))
+        restored = dataclasses.replace(case.restored, plan=case.restored.simulator.plan(spec))
+        prediction = predict(restored, scene, default_views(restored, scene, None, case.targets)[0], n_future, 0, edits)
+        rows[name] = as_bytes(render_steps(restored, prediction.particles, scene, cam))[steps, 0]
+    size = (1.6 * len(steps), 1.6 * len(rows))
+    figure, panels = pyplot().subplots(len(rows), len(steps), figsize=size, squeeze=False, layout="constrained")
+    for axes_of_row, (name, images) in zip(panels, rows.items(), strict=True):
+        axes_of_row[0].set_ylabel(name)
+        for axes, image, step in zip(axes_of_row, images, steps, strict=True):
+            axes.imshow(image)
+            axes.set(xticks=[], yticks=[])
+            if axes in panels[0]:
+                axes.set_title(f"+{(step - n_given + 1) / scene.fps:.2f} s", fontsize=9)
+    save_figure(figure, with_parents(case.figure))
+    return {"numbers": {}, "figure": case.figure.name}
+
+
+_FITTED = {"of_model": False, "device": "cuda"}
+ENTRIES = (
+    Entry(
+        MAIN,
+        "{model}",
+        partial(score, methods=METHODS, plain=False),
+        {"elastic": "33.15 ± 3.51", "cloth": "26.46", "rigid": "28.35"},
+    ),
+    Entry(MAIN, "spring-gaus", partial(fit, name="spring-gaus"), **_FITTED),
+    Entry(MAIN, "spring-gaus-given", partial(fit, name="spring-gaus-given"), **_FITTED),
+    Entry(
+        MAIN,
+        "spring-gaus-all",
+        partial(fit, name="spring-gaus-all"),
+        {"elastic": "24.13 ± 3.65", "rigid": "23.85 ± 1.01"},
+        **_FITTED,
+    ),
+    Entry(SPEED, "{model}", speed, {"elastic": "16 to 20 steps/s, H100"}, first_only=True),
+    Entry(EDITS, "{model}", edit, first_only=True),
+    *(
+        Entry(HISTORY, f"{{model}}, history {n}", partial(score, history=n), {"elastic": value})
+        for n, value in ((4, "33.15"), (2, "27.3"), (1, "22.9"))
+    ),
+    *(
+        Entry(CAMERAS, f"{{model}}, cameras {n}", partial(score, context_views=n), {"elastic": value} if value else {})
+        for n, value in ((4, ""), (3, "31.60, trained with 3"), (2, ""), (1, ""))
+    ),
+)

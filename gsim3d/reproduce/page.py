@@ -1,0 +1,260 @@
+"""The page of a reproduction: markdown, figures, and all numbers as JSON."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gsim3d.evaluate.compare import LEAST, paired
+from gsim3d.evaluate.pictures import pyplot, save_figure, write_curves
+from gsim3d.evaluate.report import facts, physics_table, summarize, write_json
+from gsim3d.evaluate.scoring import METRICS, measurable
+from gsim3d.io.files import with_parents, write_whole
+from gsim3d.reproduce.cells import from_json
+from gsim3d.reproduce.entries import CAMERAS, EDITS, HISTORY, MAIN, METHODS, SPEED, TRAINED
+
+if TYPE_CHECKING:
+    from gsim3d.reproduce.run import Row
+
+COLUMNS = {  # key of the numbers -> title, decimals
+    "future.psnr_masked": ("PSNR masked", 2),
+    "future.psnr_body": ("PSNR body", 2),
+    "future.psnr": ("PSNR", 2),
+    "future.ssim": ("SSIM", 4),
+    "future.lpips_alex": ("LPIPS alex", 4),
+    "future.lpips_vgg": ("LPIPS vgg", 4),
+    "future.fvd": ("FVD", 1),
+    "past.psnr_masked": ("given steps", 2),
+    "encode_ms": ("ms to encode", 1),
+    "step_ms": ("ms a step", 2),
+    "steps_a_second": ("steps a second", 1),
+    "parameters": ("parameters", 0),
+}
+ORDER = {table: n for n, table in enumerate((MAIN, SPEED, HISTORY, CAMERAS, EDITS, TRAINED))}
+CURVES = ("psnr_masked", "psnr_body", "ssim")
+EXPLAINED = f"""\
+PSNR in dB over predicted steps; masked: foreground, body: moving bodies. ±: standard error of paired differences over
+scenes; "=" marks differences within {LEAST:g} of them. Last: change of masked PSNR or ms a step since the run before in this folder. Paper: other
+data, which was never released, and other budgets: compare differences, not values. Cost: all seconds of a row, with
+scoring. "ms a step" includes rendering; Spring-Gaus has none, because it is fitted to each scene at that cost."""
+
+
+@dataclass
+class Line:
+    """A line of a table.
+
+    Attributes:
+        row: the row that it belongs to; baselines share that of the first model.
+        label: its name.
+        numbers: keys of COLUMNS -> value.
+        by_scene: scene -> value that is compared: masked PSNR (PSNR without masks), or milliseconds.
+        summary: see :func:`gsim3d.evaluate.report.summarize`; {} for rows without images.
+        against: (mean, standard error) of the difference to the first line of the table or model; None for the first.
+        last: mean change since the last run; None if there was none.
+    """
+
+    row: Row
+    label: str
+    numbers: dict[str, float]
+    by_scene: dict[str, float]
+    summary: dict = field(default_factory=dict)
+    against: tuple[float, float | None] | None = None
+    last: float | None = None
+
+
+def write(out: Path, rows: Sequence[Row], facts: dict) -> tuple[dict, list[Path]]:
+    """Writes reproduce.md, reproduce.json and figures/; returns the content of the JSON file, and the paths."""
+    parts, files, lines = [], [], []
+    for table, world in dict.fromkeys((row.table, row.world) for row in sorted(rows, key=lambda row: ORDER[row.table])):
+        own = _lines([row for row in rows if (row.table, row.world) == (table, world)])
+        if not own:
+            continue
+        if table == MAIN:
+            _add_times(own, [row for row in rows if (row.table, row.world) == (SPEED, world)])
+        pictures = _figures(out / "figures", table, world, own)
+        parts += [f"## {table}: {world}", "" if table == EDITS else _table(own), _physics(own) if table == MAIN else ""]
+        parts += [f"![{path.stem}](figures/{path.name})" for path in pictures]
+        files += pictures
+        lines += own
+    n_cells, n_missing = (sum(map(len, found)) for found in zip(*((row.cells, row.missing) for row in rows)))
+    machine = f"gsim3d {facts['gsim3d']}, torch {facts['torch']}, on {facts['device']}"
+    head = [
+        "# Reproduction of the paper",
+        f"Made by `{facts['command']}` with {machine}. {n_cells} of {n_cells + n_missing} measurements are made.",
+        EXPLAINED,
+    ]
+    missing = _missing(rows)
+    lists = ["## Missing", "\n".join(f"- {line}" for line in missing)] if missing else []
+    unmeasured = [f"{METRICS[name].label} is not measured: {reason}." for name, reason in measurable()[1].items()]
+    page, data = out / "reproduce.md", out / "reproduce.json"
+    write_whole(page, "\n\n".join(part for part in [*head, *parts, *lists, *unmeasured] if part) + "\n")
+    content = {**facts, "made": n_cells, "lines": [_as_dict(line) for line in lines], "missing": missing}
+    write_json(data, content)
+    return content, [page, data, *files]
+
+
+def _lines(rows: Sequence[Row]) -> list[Line]:
+    """Lines of one table and world, with differences to the first."""
+    models = list(dict.fromkeys(row.model for row in rows))
+    known = sorted((row for row in rows if row.cells), key=lambda row: models.index(row.model))
+    found = [_line(row) for row in known]
+    if known and known[0].table == MAIN and known[0].model:
+        found[1:1] = [_line(known[0], method) for method in METHODS]
+    for line in found:
+        same = [other for other in found if known[0].table == MAIN or other.row.model == line.row.model]
+        line.against = None if line is same[0] or known[0].table == SPEED else _difference(line, same[0].by_scene)
+    return found
+
+
+def _line(row: Row, method: str = "") -> Line:
+    """The line of a row; with ``method`` that of a baseline in its cells."""
+    numbers, by_scene, summary = _numbers(row.cells, method)
+    line = Line(row, method.replace("_", " ") or row.label, numbers, by_scene, summary)
+    change = _difference(line, _numbers(row.before, method)[1]) if row.before else None
+    line.last = change and change[0]
+    return line
+
+
+def _numbers(cells: dict[str, dict], method: str) -> tuple[dict, dict, dict]:
+    """(numbers, by_scene, summary) of the cells of a row."""
+    results = {scene: cell["result"] for scene, cell in cells.items()}
+    first = next(iter(results.values()))
+    if "scores" not in first:
+        return first["numbers"], first.get("by_scene", {"": first["numbers"].get("step_ms")}), {}
+    own = {scene: result["scores"] for scene, result in results.items()}
+    fitted = next((name for name in first["scores"]["values"] if name not in METHODS), "")
+    summary = summarize([from_json({**scores, "scene": scene}, method or fitted) for scene, scores in own.items()])
+    head = "psnr_masked" if "future.psnr_masked" in summary else "psnr"
+    by_scene = {scene: scores.get(f"future.{head}") for scene, scores in summary["scenes"].items()}
+    return {key: summary[key] for key in COLUMNS if summary.get(key) is not None}, by_scene, summary
+
+
+def _difference(line: Line, other: dict[str, float]) -> tuple[float, float | None] | None:
+    """Mean and standard error of the paired difference over the scenes of both; None if they share none."""
+    pairs = [
+        value - other[scene]
+        for scene, value in line.by_scene.items()
+        if value is not None and other.get(scene) is not None
+    ]
+    return paired(pairs) if pairs else None
+
+
+def _add_times(lines: Sequence[Line], speeds: Sequence[Row]) -> None:
+    """Adds the time of a step and the number of parameters to the lines of models."""
+    for line in lines:
+        for row in speeds:
+            if line.label == row.model and row.cells:
+                found = _numbers(row.cells, "")[0]
+                line.numbers |= {key: found[key] for key in ("step_ms", "parameters")}
+
+
+def _table(lines: Sequence[Line]) -> str:
+    shown = [key for key in COLUMNS if any(key in line.numbers for line in lines)]
+    head = ["row", *(COLUMNS[key][0] for key in shown), "against first, dB", "last", "paper (other data)"]
+    cells = [[*head, "scenes", "cost, s", "device", "seed"]]
+    cells.append(["---"] * len(cells[0]))
+    for line in lines:
+        row, whole = line.row, line.label == line.row.label
+        cost = sum(cell["seconds"] for cell in row.cells.values())
+        cells.append(
+            [
+                line.label,
+                *(f"{line.numbers[key]:,.{COLUMNS[key][1]}f}" if key in line.numbers else "-" for key in shown),
+                _against(line.against),
+                "-" if line.last is None else f"{line.last:+.2f}",
+                whole and row.paper or "-",
+                str(len(row.cells)),
+                f"{cost:.1f}" if whole else "-",
+                ", ".join(sorted({cell["device"] for cell in row.cells.values()})),
+                "-" if row.seed is None else str(row.seed),
+            ]
+        )
+    return "\n".join(f"| {' | '.join(texts)} |" for texts in cells)
+
+
+def _against(difference: tuple[float, float | None] | None) -> str:
+    if difference is None:
+        return "-"
+    mean, error = difference
+    if error is None:
+        return f"{mean:+.2f}"
+    return f"{'= ' if abs(mean) <= LEAST * error else ''}{mean:+.2f} ± {error:.2f}"
+
+
+def _merged(lines: Sequence[Line]) -> dict:
+    """One summary with every line as a method, for curves and physical measures over time."""
+    first = lines[0].summary
+    merged = {key: first[key] for key in ("n_encoded_steps", "n_future_steps")}
+    merged["n_future_steps"] = min(line.summary["n_future_steps"] for line in lines)
+    for key in ("by_step", "by_step_std"):
+        merged[key] = {f"{ln.label}.{m}": v for ln in lines for m, v in ln.summary[key].items() if m in METRICS}
+    physics = {line.label: line.summary["physics"]["model"] for line in lines if "model" in line.summary["physics"]}
+    truth = {"truth": first["physics"]["truth"]} if "truth" in first["physics"] else {}
+    return {**merged, "methods": [line.label for line in lines], "physics": {**truth, **physics}}
+
+
+def _physics(lines: Sequence[Line]) -> str:
+    return "\n".join([*facts(lines[0].summary), *physics_table(_merged(lines))])
+
+
+def _figures(folder: Path, table: str, world: str, lines: Sequence[Line]) -> list[Path]:
+    """Writes the figures of a table: curves over time, accuracy against time; returns all that belong to it."""
+    if table == EDITS:
+        return [folder / cell["result"]["figure"] for line in lines for cell in line.row.cells.values()]
+    if not lines[0].summary:
+        return []
+    curves = folder / f"{table} {world} curves.png".lower().replace(" ", "-")
+    write_curves(with_parents(curves), _merged(lines), None, CURVES)
+    timed = [line for line in lines if table == MAIN and _seconds(line) is not None]
+    if not timed:
+        return [curves]
+    plt, file = pyplot(), folder / f"accuracy-against-time-{world}.png"
+    figure, axes = plt.subplots(figsize=(5, 3.8), layout="constrained")
+    for line in timed:
+        value = statistics.fmean(value for value in line.by_scene.values() if value is not None)
+        axes.plot(_seconds(line), value, "o")
+        axes.annotate(line.label, (_seconds(line), value), (5, 4), textcoords="offset points", fontsize=8)
+    axes.set(xscale="log", xlabel="seconds a predicted step (fits: all of it)", ylabel="PSNR masked, dB", title=world)
+    axes.grid(alpha=0.3)
+    save_figure(figure, file)
+    return [curves, file]
+
+
+def _seconds(line: Line) -> float | None:
+    """Seconds a predicted step: of a model measured alone, of a fitted method its whole cost; None if unknown."""
+    if not line.row.model:
+        cost = statistics.fmean(cell["seconds"] for cell in line.row.cells.values())
+        return cost / line.summary["n_future_steps"]
+    return line.numbers["step_ms"] / 1e3 if "step_ms" in line.numbers else None
+
+
+def _missing(rows: Sequence[Row]) -> list[str]:
+    """One line for each table, world and reason: the rows, with their numbers of missing measurements."""
+    found: dict[tuple[str, str, str], list[str]] = {}
+    for row in rows:
+        for scene, reason in row.missing.items():
+            found.setdefault((row.table, row.world, reason), []).append(row.label)
+    return [
+        f"{table}, {world}: {reason}: " + ", ".join(f"{name} ({labels.count(name)})" for name in dict.fromkeys(labels))
+        for (table, world, reason), labels in found.items()
+    ]
+
+
+def _as_dict(line: Line) -> dict:
+    row = line.row
+    return {
+        "table": row.table,
+        "world": row.world,
+        "row": line.label,
+        "numbers": line.numbers,
+        "by_scene": line.by_scene,
+        "against_first": line.against,
+        "since_last": line.last,
+        "paper_other_data": row.paper if line.label == row.label else "",
+        "seconds": {scene: cell["seconds"] for scene, cell in row.cells.items()},
+        "devices": sorted({cell["device"] for cell in row.cells.values()}),
+        "seed": row.seed,
+    }
