@@ -37,9 +37,10 @@ ORDER = {table: n for n, table in enumerate((MAIN, SPEED, HISTORY, CAMERAS, EDIT
 CURVES = ("psnr_masked", "psnr_body", "ssim")
 EXPLAINED = f"""\
 PSNR in dB over predicted steps; masked: foreground, body: moving bodies. ±: standard error of paired differences over
-scenes; "=" marks differences within {LEAST:g} of them. Last: change of masked PSNR or ms a step since the run before in this folder. Paper: other
-data, which was never released, and other budgets: compare differences, not values. Cost: all seconds of a row, with
-scoring. "ms a step" includes rendering; Spring-Gaus has none, because it is fitted to each scene at that cost."""
+scenes; "=" marks differences within {LEAST:g} of them. Last: change of masked PSNR (Speed: of ms a step) since the run
+before in this folder. Paper: other data, which was never released, and other budgets: compare differences, not values.
+Cost: all seconds of a row, with scoring. "ms a step" includes rendering; a method that is fitted to each scene has its
+cost instead."""
 
 
 @dataclass
@@ -65,7 +66,7 @@ class Line:
     last: float | None = None
 
 
-def write(out: Path, rows: Sequence[Row], facts: dict) -> tuple[dict, list[Path]]:
+def write(out: Path, rows: Sequence[Row], about: dict) -> tuple[dict, list[Path]]:
     """Writes reproduce.md, reproduce.json and figures/; returns the content of the JSON file, and the paths."""
     parts, files, lines = [], [], []
     for table, world in dict.fromkeys((row.table, row.world) for row in sorted(rows, key=lambda row: ORDER[row.table])):
@@ -80,10 +81,10 @@ def write(out: Path, rows: Sequence[Row], facts: dict) -> tuple[dict, list[Path]
         files += pictures
         lines += own
     n_cells, n_missing = (sum(map(len, found)) for found in zip(*((row.cells, row.missing) for row in rows)))
-    machine = f"gsim3d {facts['gsim3d']}, torch {facts['torch']}, on {facts['device']}"
+    machine = f"gsim3d {about['gsim3d']}, torch {about['torch']}, on {about['device']}"
     head = [
         "# Reproduction of the paper",
-        f"Made by `{facts['command']}` with {machine}. {n_cells} of {n_cells + n_missing} measurements are made.",
+        f"Made by `{about['command']}` with {machine}. {n_cells} of {n_cells + n_missing} measurements are made.",
         EXPLAINED,
     ]
     missing = _missing(rows)
@@ -91,7 +92,7 @@ def write(out: Path, rows: Sequence[Row], facts: dict) -> tuple[dict, list[Path]
     unmeasured = [f"{METRICS[name].label} is not measured: {reason}." for name, reason in measurable()[1].items()]
     page, data = out / "reproduce.md", out / "reproduce.json"
     write_whole(page, "\n\n".join(part for part in [*head, *parts, *lists, *unmeasured] if part) + "\n")
-    content = {**facts, "made": n_cells, "lines": [_as_dict(line) for line in lines], "missing": missing}
+    content = {**about, "made": n_cells, "lines": [_as_dict(line) for line in lines], "missing": missing}
     write_json(data, content)
     return content, [page, data, *files]
 
@@ -235,7 +236,7 @@ def _missing(rows: Sequence[Row]) -> list[str]:
     """One line for each table, world and reason: the rows, with their numbers of missing measurements."""
     found: dict[tuple[str, str, str], list[str]] = {}
     for row in rows:
-        for scene, reason in row.missing.items():
+        for reason in row.missing.values():
             found.setdefault((row.table, row.world, reason), []).append(row.label)
     return [
         f"{table}, {world}: {reason}: " + ", ".join(f"{name} ({labels.count(name)})" for name in dict.fromkeys(labels))

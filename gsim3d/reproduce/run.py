@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -14,7 +15,7 @@ import torch
 
 from gsim3d import pretrained
 from gsim3d.data import find_scenes
-from gsim3d.errors import CaptureError, InputError, NumericalError
+from gsim3d.errors import CaptureError, FitWarning, InputError, NumericalError
 from gsim3d.evaluate.ablations import Study, base_run, load_ablations
 from gsim3d.evaluate.pictures import pyplot
 from gsim3d.evaluate.protocol import default_views
@@ -24,7 +25,7 @@ from gsim3d.io.machine import machine
 from gsim3d.io.settings import to_dict
 from gsim3d.reproduce import page
 from gsim3d.reproduce.cells import Cells
-from gsim3d.reproduce.entries import ENTRIES, TRAINED, Case, Entry
+from gsim3d.reproduce.entries import ENTRIES, MAIN, TRAINED, Case, Entry
 from gsim3d.synth import generate
 from gsim3d.synth.held_out import SETS, origin_of
 from gsim3d.train.config import TrainConfig
@@ -166,7 +167,7 @@ class _Run:
     def __init__(self, job: Job, out: Path, say: Callable[[str], None]):
         self.job, self.out, self.say, self.rows = job, out, say, {}
         self._end = time.monotonic() + 60 * (math.inf if job.budget is None else job.budget)
-        self._cells, self._costs = Cells(out), {}
+        self._cells, self._costs, self._first = Cells(out), {}, {}
         facts = machine(torch.device(job.device))
         self._conditions = {name: facts[name] for name in CONDITIONS if name in facts}
 
@@ -176,28 +177,32 @@ class _Run:
             for world, named in models.items():
                 if number >= self._count(world):
                     continue
+                self._first.setdefault(world, next(iter(named.values())))
                 folder = self._scene(world, number)
                 for entry in ENTRIES:
                     if number and entry.first_only:
                         continue
                     for name, restored in named.items() if entry.of_model else [("", None)]:
                         row = self._row(entry.table, entry.row.format(model=name), world, name, entry.paper)
-                        self._score(row, entry, folder, restored, next(iter(named.values())))
+                        self._score(row, entry, folder, restored)
 
-    def _score(self, row: Row, entry: Entry, folder: Path | None, restored: Restored | None, first: Restored) -> None:
+    def _score(self, row: Row, entry: Entry, folder: Path | None, restored: Restored | None) -> None:
+        needs = f"needs --device {entry.device}" if entry.device and entry.device != self.job.device else None
         if folder is None:
-            row.missing["scenes"] = NO_TIME
+            row.missing["scene"] = needs or NO_TIME
             return
         job, scene = self.job, folder.relative_to(self._root(row.world)).as_posix()
         origin, file = origin_of(folder), folder / "metadata.json"
         row.seed = origin.seed if origin else None
 
         def run() -> dict:
+            if row.table != MAIN or row.cells:  # what is fitted to a model is printed once
+                warnings.simplefilter("ignore", FitWarning)
             figure = self.out / "figures" / re.sub(r"\W+", "-", f"{row.world} {row.label} {row.table}".lower())
             return entry.run(Case(restored, folder, targets, job.steps, figure.with_suffix(".png"), job.device))
 
         try:
-            targets = default_views(first, first.open_scene(folder))[1]
+            targets = self._targets(row.world, folder)
         except InputError as error:
             row.missing[scene] = str(error)
             return
@@ -207,11 +212,15 @@ class _Run:
             "targets": list(targets),
             "steps": job.steps,
         }
-        needs = f"needs --device {entry.device}" if entry.device and entry.device != job.device else None
         cost = self._costs.get((entry.table, entry.row), 0)
         self._measure(row, scene, asked, run, needs or (NO_TIME if time.monotonic() + cost > self._end else None))
         if scene in row.cells:
             self._costs[entry.table, entry.row] = row.cells[scene]["seconds"]
+
+    def _targets(self, world: str, folder: Path) -> tuple[int, ...]:
+        """Returns the target cameras of a scene: those that the first model's training excluded from inputs."""
+        with warnings.catch_warnings(action="ignore", category=FitWarning):
+            return default_views(self._first[world], self._first[world].open_scene(folder))[1]
 
     def train(self, world: str, base: TrainConfig) -> Restored | None:
         """Trains the ablations of a world; returns the model of the first one, the base run, if it is finished."""
@@ -247,7 +256,8 @@ class _Run:
         if cell is None and reason is None:
             start = time.monotonic()
             try:
-                result = run()
+                with warnings.catch_warnings():
+                    result = run()
             except (InputError, NumericalError, CaptureError, torch.OutOfMemoryError) as error:
                 reason = str(error).splitlines()[0]
             else:

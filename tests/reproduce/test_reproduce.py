@@ -1,72 +1,160 @@
-"""The page of tables: measured within a budget, continued, compared with the last run."""
+"""The page of the paper's tables: measured within a budget, continued, compared with the last run."""
 
-import dataclasses
-import json
-import math
-from pathlib import Path
+import shutil
 
 import pytest
-import torch
 
 from gsim3d.cli.main import main
-from gsim3d.data import Scene
-from gsim3d.errors import InputError
+from gsim3d.data import find_scenes
 from gsim3d.evaluate.ablations import load_ablations
+from gsim3d.evaluate.compare import paired
 from gsim3d.evaluate.protocol import score_scene
 from gsim3d.evaluate.report import summarize
-from gsim3d.evaluate.scoring import SceneScores
-from gsim3d.reproduce import run
+from gsim3d.io.files import read_yaml
+from gsim3d.io.settings import from_dict
+from gsim3d.reproduce import page, run
 from gsim3d.reproduce.cells import from_json, to_json
-from gsim3d.reproduce.run import Job, reproduce
+from gsim3d.reproduce.run import NO_TIME, Job, reproduce
+from gsim3d.train.config import TrainConfig
 from gsim3d.train.restore import restore
 from tests.tiny_scenes import write_scenes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 TRAINING = """
-data: {history: 2, context_views: 2, target_only_cameras: [3], background_stride: 4}
+seed: {}
+data: {{history: 2, context_views: 2, target_only_cameras: [3], background_stride: 4}}
 phases:
-  - {steps: 2, horizon: 1, target_views: 2}
+  - {{steps: 2, horizon: 1, target_views: 2}}
 """
+MAIN = "Main table"
 
 
 @pytest.fixture(scope="module")
 def work(tmp_path_factory, one_thread):
-    """Sets of a world and two models."""
+    """The sets of a world, and two models."""
     root = tmp_path_factory.mktemp("work")
     write_scenes(root / "sets" / "elastic", 2)
     write_scenes(root / "sets" / "elastic-train", 3)
-    (root / "train.yaml").write_text(TRAINING)
-    for name in ("one", "two"):
-        arguments = ["--data", root / "sets" / "elastic-train", "--out", root / "runs" / name, "--seed", len(name)]
-        arguments = [*arguments[:4], "--export", root / f"{name}.safetensors"]
-        assert main(["train", *map(str, [root / "train.yaml", *arguments])]) == 0
+    for seed, name in enumerate(("one", "two")):
+        (root / f"{name}.yaml").write_text(TRAINING.format(seed))
+        where = {"--data": "sets/elastic-train", "--out": f"runs/{name}", "--export": f"{name}.safetensors"}
+        options = [text for option, path in where.items() for text in (option, str(root / path))]
+        assert main(["train", str(root / f"{name}.yaml"), *options]) == 0
     return root
 
 
-def made(work, out, **options) -> tuple[dict, dict]:
-    """(content, lines by table and row) of a call; prints are kept in the content."""
+def made(work, out, *models, **options) -> tuple[dict, dict, list]:
+    """(content, lines by table and row, what was measured) of a call."""
     said = []
-    models = [str(work / f"{name}.safetensors") for name in options.pop("models", ("one",))]
-    job = Job(str(out), models, data=str(work / "sets"), **options)
-    content, files = reproduce(job, "gsim3d reproduce", said.append)
+    models = [str(work / f"{name}.safetensors") for name in models or ("one",)]
+    content, files = reproduce(Job(str(out), models, data=str(work / "sets"), **options), "command", said.append)
     assert all(file.stat().st_size for file in files)
-    return {**content, "said": said}, {(line["table"], line["row"]): line for line in content["lines"]}
+    return content, {(line["table"], line["row"]): line for line in content["lines"]}, said
 
 
 @pytest.fixture(scope="module")
 def first(work):
-    return made(work, work / "out", models=("one", "two"))
+    return made(work, work / "out", "one", "two")
 
 
-def test_every_row_of_the_data_is_there(first, work):
-    content, lines = first
-    main_rows = [row for table, row in lines if table == "Main table"]
+def test_every_row_that_the_data_allow(first, work):
+    content, lines, _ = first
+    main_rows = [row for table, row in lines if table == MAIN]
     assert main_rows == ["one", "constant", "copy", "constant velocity", "two"]
-    assert ("Speed", "one") in lines and ("Edits", "one") in lines
-    assert ("History length at inference", "two, 1 steps") in lines
-    assert lines["Main table", "one"]["paper_other_data"] == "33.15 ± 3.51"
-    page = (work / "out" / "reproduce.md").read_text()
-    for text in ("momentum [m/s]", "other data", "## Missing", "needs --device cuda: spring-gaus (ball/0000)", "±"):
+    assert {("Speed", "one"), ("Edits", "two"), ("History length at inference", "two, history 1")} <= lines.keys()
+    assert lines[MAIN, "one"]["paper_other_data"] == "33.15 ± 3.51" and not lines[MAIN, "copy"]["paper_other_data"]
+    assert lines[MAIN, "two"]["numbers"]["step_ms"] == lines["Speed", "two"]["numbers"]["step_ms"] > 0
+    page, missing = (work / "out" / "reproduce.md").read_text(), " ".join(content["missing"])
+    for text in ("momentum [m/s] | two", "other data", "(figures/main-table-elastic-curves.png)"):
         assert text in page, text
-    reasons = " ".join(content["missing"])
-    assert "4 steps" in reasons and "trained with 2 input steps of 2 cameras" in reasons
+    assert "needs --device cuda: spring-gaus (2), spring-gaus-given (2)" in missing
+    assert "trained with 2 input steps of 2 cameras: one, history 4 (2)" in missing
+
+
+def test_scores_are_those_of_evaluate(first, work):
+    restored, lines = restore(work / "one.safetensors"), first[1]
+    scenes = [restored.open_scene(folder) for folder in find_scenes(work / "sets" / "elastic")]
+    scores = [score_scene(restored, scene, target_cams=(3,), start=2) for scene in scenes]
+    summary = summarize(scores)
+    found = lines[MAIN, "one"]["numbers"]
+    assert found["future.psnr_masked"] == pytest.approx(summary["future.psnr_masked"])
+    assert found["past.psnr_masked"] == pytest.approx(summary["past.psnr_masked"])
+    copied = lines[MAIN, "copy"]
+    assert copied["numbers"]["future.ssim"] == pytest.approx(summary["copy.future.ssim"])
+    pairs = [copied["by_scene"][scene] - value for scene, value in lines[MAIN, "one"]["by_scene"].items()]
+    assert len(pairs) == 2 and copied["against_first"] == paired(pairs)
+    again = summarize([from_json({**to_json(score, 2), "scene": scene.name}) for score, scene in zip(scores, scenes)])
+    assert again["future.psnr"] == summary["future.psnr"] and again["past.ssim"] == summary["past.ssim"]
+
+
+def test_a_shorter_history_predicts_the_same_steps(first, work):
+    restored = restore(work / "one.safetensors")
+    scene = restored.open_scene(find_scenes(work / "sets" / "elastic")[0])
+    scores = to_json(score_scene(restored, scene, target_cams=(3,), start=2), 4)
+    assert scores["n_encoded"] == 4 and scores["n_steps"] == scene.n_steps == len(scores["values"]["model"]["psnr"])
+    assert scores["values"]["model"]["psnr"][:2] == [None, None]
+
+
+@pytest.fixture
+def no_curves(monkeypatch):
+    """Drawing is slow."""
+    monkeypatch.setattr(page, "write_curves", lambda path, *content: path.write_text("curves"))
+
+
+def test_the_next_call_continues(first, work, tmp_path, no_curves):
+    out = tmp_path / "out"
+    shutil.copytree(work / "out", out)
+    (cell,) = (out / "cells" / MAIN.replace(" ", "-") / "elastic" / "two").glob("*0001.json")
+    cell.write_text(cell.read_text()[:-20])
+    content, lines, said = made(work, out, "one", "two")
+    assert len(said) == 1 and "two, ball/0001" in said[0]
+    assert lines[MAIN, "two"]["by_scene"] == first[1][MAIN, "two"]["by_scene"]
+
+
+def test_other_weights_are_compared_with_the_last_run(first, work, tmp_path, no_curves):
+    shutil.copytree(work / "out", tmp_path / "out")
+    shutil.copytree(work / "sets", tmp_path / "sets")
+    shutil.copy(work / "two.safetensors", tmp_path / "one.safetensors")
+    _, lines, said = made(tmp_path, tmp_path / "out", steps=None)
+    one, two, now = first[1][MAIN, "one"], first[1][MAIN, "two"], lines[MAIN, "one"]
+    assert said and now["by_scene"] == pytest.approx(two["by_scene"])
+    change = two["numbers"]["future.psnr_masked"] - one["numbers"]["future.psnr_masked"]
+    assert now["since_last"] == pytest.approx(change) and change != 0
+    assert lines[MAIN, "copy"]["since_last"] == 0 and one["since_last"] is None
+
+
+def test_a_budget_that_ends_lists_what_is_missing(work, tmp_path):
+    content, lines, said = made(work, tmp_path / "out", budget=1e-9)
+    assert not lines and not said
+    assert any(NO_TIME in line and "one (2)" in line for line in content["missing"])
+    assert f"{MAIN}, elastic: {NO_TIME}" in (tmp_path / "out" / "reproduce.md").read_text()
+
+
+def test_training(work, tmp_path, monkeypatch, no_curves):
+    few = {name: load_ablations()[1][name] for name in ("latent", "calls-1")}
+    base = from_dict(TrainConfig, read_yaml(work / "one.yaml"))
+    monkeypatch.setattr(run, "load_ablations", lambda: ({"tiny": base}, few))
+    content, lines, said = made(work, tmp_path / "out", train=1, trajectories=1)
+    assert ("Ablations", "latent: the base run") in lines and (MAIN, "trained here") in lines
+    assert made(work, tmp_path / "out", train=1, trajectories=1)[2] == []
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["--worlds", "elastik"], "'elastik' does not exist; choose from elastic"),
+        (["--data", "{work}/none"], "none is not a folder"),
+        (["rigid={work}/one.safetensors"], "'rigid' is not among the worlds elastic"),
+        (["{work}/one.safetensors", "{work}/runs/../one.safetensors"], "two models named one"),
+        (["--preset", "small"], "is the base run of --train"),
+        (["--train", "1"], "at least 2"),
+        (["{work}/none.safetensors"], "no such checkpoint"),
+    ],
+)
+def test_bad_options(capsys, work, tmp_path, arguments, message):
+    given = [text.format(work=work) for text in arguments]
+    options = ["--out", str(tmp_path / "out"), *([] if "--data" in given else ["--data", str(work / "sets")])]
+    assert main(["reproduce", *given, *options]) == 2
+    errors = capsys.readouterr().err
+    assert message in errors and errors.count("\n") == 1
+    assert not (tmp_path / "out").exists()
