@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -366,6 +367,7 @@ class Simulator(nn.Module):
         plan: Plan | None = None,
         *,
         plans: Sequence[Plan] | None = None,
+        active: Tensor | None = None,
         cutoff: str = "exact",
         on_invalid: OnInvalid | None = None,
         report: StabilityReport | None = None,
@@ -379,6 +381,7 @@ class Simulator(nn.Module):
             plan: selects the outputs and the degree of view-dependent colour. Default: colour, alpha and depth, at the
                 model's degree.
             plans: one plan per scene, instead of ``plan``, all with the same outputs.
+            active: bool [I, H, W], pixels that are wanted, see :func:`gsim3d.ops.rasterize_gaussians`. Default: all.
             cutoff: see :func:`gsim3d.ops.rasterize_gaussians`.
             on_invalid: policy for invalid numbers. Default: the model's.
             report: counts invalid numbers. Default: ``self.report``.
@@ -389,14 +392,12 @@ class Simulator(nn.Module):
         Raises:
             InputError: the number of ``plans`` is not that of the scenes, or their outputs differ.
         """
+        options: dict[str, Any] = {"active": active, "cutoff": cutoff, "on_invalid": on_invalid, "report": report}
         if plans is not None:
-            options = {"cutoff": cutoff, "on_invalid": on_invalid, "report": report}
             return self._render_by_plan(particles, cameras, background, plans, **options)
         guard = self._guard("render", on_invalid, report, in_workspace=False)
         self._check(particles, "render")
-        image = self._draw(
-            guard(particles), cameras, background, plan, cutoff=cutoff, on_invalid=on_invalid, report=report
-        )
+        image = self._draw(guard(particles), cameras, background, plan, **options)
         guard.keywords["report"].send()
         return image
 
@@ -407,6 +408,7 @@ class Simulator(nn.Module):
         background: Tensor | None = None,
         plan: Plan | None = None,
         *,
+        active: Tensor | None = None,
         cutoff: str = "exact",
         on_invalid: OnInvalid | None = None,
         report: StabilityReport | None = None,
@@ -420,6 +422,7 @@ class Simulator(nn.Module):
             cameras,
             background,
             features=particles.latents if outputs.features else None,
+            active=active,
             cutoff=cutoff,
             jacobian=self.config.renderer.jacobian,
             on_invalid=on_invalid,
@@ -433,13 +436,14 @@ class Simulator(nn.Module):
     ) -> Rendering:
         if len({plan.spec.outputs for plan in plans}) > 1:
             raise InputError("plans: must have equal outputs")
-        shown, order, images = cameras.image_cloud.tolist(), [], []
+        shown, order, images, active = cameras.image_cloud.tolist(), [], [], options.pop("active")
         for plan, clouds in by_plan(particles, plans):
             rows = [i for i, cloud in enumerate(shown) if cloud in clouds]
             chosen = torch.tensor(rows, device=cameras.near.device, dtype=torch.int64)
             image_cloud = torch.tensor([clouds.index(shown[i]) for i in rows], device=chosen.device, dtype=torch.int64)
             behind = background if background is None or background.dim() == 1 else background[chosen]
             selected = cameras.select(chosen, image_cloud)
+            options["active"] = None if active is None else active[chosen]
             images.append(self.render(particles.select_clouds(clouds), selected, behind, plan, **options))
             order += rows
         back = torch.argsort(torch.tensor(order, device=cameras.near.device))

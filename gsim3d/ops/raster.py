@@ -7,6 +7,7 @@ from functools import partial
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from gsim3d._core import constants
@@ -22,6 +23,7 @@ LARGEST: float = constants["raster_largest"]
 CUTOFFS: dict[str, int] = constants["raster_cutoffs"]
 JACOBIANS: dict[str, int] = constants["raster_jacobians"]
 FAULTS: tuple[str, ...] = constants["raster_faults"]
+TILE = 16  # pixels, kTile of csrc/gsim3d/raster/raster_math.h
 ROW_FAULTS: int = constants["raster_row_faults"]  # the first faults are of rows
 
 
@@ -53,6 +55,7 @@ def rasterize_gaussians(
     features: Tensor | None = None,
     background: Tensor | None = None,
     cu_rows: Tensor | None = None,
+    active: Tensor | None = None,
     near_plane: float = 0.01,
     cutoff: str = "exact",
     jacobian: str = "exact",
@@ -81,6 +84,8 @@ def rasterize_gaussians(
         features: [N, F] extra channels, any F.
         background: [3] or [I, 3]; default black.
         cu_rows: int64 [Q + 1], rows of cloud q are cu_rows[q] .. cu_rows[q + 1]; default one cloud.
+        active: bool [I, H, W], pixels that are wanted, such as those that a loss reads; default all. A tile of 16 x 16
+            pixels without any shows its background, as if no Gaussian was there; the others have the same bits.
         near_plane: metres, positive; Gaussians whose centre is not beyond it are left out.
         cutoff: "exact"; "tile3sigma" also drops pixels outside the 16 x 16 tiles that a square of 3 standard deviations
             touches, as the published model's renderer does; "smooth" fades alpha between 2/255 and 1/255, so that the
@@ -127,9 +132,8 @@ def rasterize_gaussians(
     rows = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
     if not compiling:
         optional = {"sh": sh, "colors": colors, "features": features, "background": background, "cu_rows": cu_rows}
-        _check_arguments(rows, {k: v for k, v in optional.items() if v is not None}, cameras, near_plane)
-    name, color = _check_choices(sh, colors, cutoff, jacobian)
-    check_on_invalid(on_invalid)
+        _check_arguments(rows, optional | {"active": active}, cameras, near_plane)
+    name, color = _check_choices(sh, colors, cutoff, jacobian, on_invalid)
     n, n_images = means.shape[0], cameras.viewmats.shape[0]
     real = torch.float64 if means.dtype == torch.float64 else torch.float32
     rows[name] = color.to(real) if color.dtype == torch.float16 else color
@@ -137,8 +141,7 @@ def rasterize_gaussians(
     if on_invalid == "clamp":
         _check_rows(rows)
         rows = _clamped(rows, report)
-    if cu_rows is None:
-        cu_rows = torch.tensor([0, n], device=means.device)
+    cu_rows = torch.tensor([0, n], device=means.device) if cu_rows is None else cu_rows
     watch = not compiling and _is_watched(on_invalid, report, means)
     args = (
         *rows.values(),
@@ -154,6 +157,7 @@ def rasterize_gaussians(
         JACOBIANS[jacobian],
         *sizes_of_state(means, n_images, cu_rows.shape[0] - 1, cameras.width, cameras.height),
         watch,
+        *(() if active is None else [_tiles_with(active)]),
     )
     if compiling:
         out = torch.ops.gsim3d.rasterize_gaussians(*args)
@@ -165,6 +169,13 @@ def rasterize_gaussians(
         read = partial(_unusable, names=(*rows, "scales", "scales", "cameras"), action=action)
         (StabilityReport() if report is None else report).record(out[7], read, counts=range(0, out[7].numel(), 2))
     return Rendering(out[0], out[1], out[2], None if features is None else out[3])
+
+
+def _tiles_with(active: Tensor) -> Tensor:
+    """bool [I, tiles by column, tiles by row] of pixels [I, H, W]: whether any of a tile's is true."""
+    height, width = active.shape[1:]
+    tiles = F.pad(active, (0, -width % TILE, 0, -height % TILE))
+    return tiles.unflatten(2, (-1, TILE)).unflatten(1, (-1, TILE)).any((2, 4))
 
 
 def _is_watched(on_invalid: OnInvalid, report: StabilityReport | None, means: Tensor) -> bool:
@@ -215,10 +226,13 @@ def _counted(counts: Tensor, names: list[str]) -> Reading:
     )
 
 
-def _check_arguments(rows: dict[str, Tensor], optional: dict[str, Tensor], cameras: Cameras, near_plane: float) -> None:
+def _check_arguments(
+    rows: dict[str, Tensor], optional: dict[str, Tensor | None], cameras: Cameras, near_plane: float
+) -> None:
     """Types, and the shapes that are read before the kernel checks them."""
     if not isinstance(cameras, Cameras):
         raise TypeError(f"rasterize_gaussians: cameras must be gsim3d.Cameras; got {type(cameras).__name__}")
+    optional = {name: value for name, value in optional.items() if value is not None}
     of_cameras = {f"cameras.{name}": getattr(cameras, name) for name in ("viewmats", "Ks", "image_cloud")}
     check_tensors("rasterize_gaussians", **rows, **optional, **of_cameras)
     check_floating("rasterize_gaussians", means=rows["means"])
@@ -229,10 +243,16 @@ def _check_arguments(rows: dict[str, Tensor], optional: dict[str, Tensor], camer
         value = rows.get(name, of_cameras.get(name, optional.get(name)))
         if value is not None and value.dim() != shape.count(",") + 1:
             raise ValueError(f"rasterize_gaussians: {name} must be {shape}; got {list(value.shape)}")
+    active, size = optional.get("active"), (len(cameras.viewmats), cameras.height, cameras.width)
+    if active is not None and (active.shape != size or active.dtype != torch.bool):
+        raise ValueError(f"{OP}: active must be bool [I, H, W] = {list(size)}; got {active.dtype} {list(active.shape)}")
 
 
-def _check_choices(sh: Tensor | None, colors: Tensor | None, cutoff: str, jacobian: str) -> tuple[str, Tensor]:
+def _check_choices(
+    sh: Tensor | None, colors: Tensor | None, cutoff: str, jacobian: str, on_invalid: OnInvalid
+) -> tuple[str, Tensor]:
     """Returns the name and the tensor of colours."""
+    check_on_invalid(on_invalid)
     if (sh is None) == (colors is None):
         raise ValueError("rasterize_gaussians: give one of sh and colors")
     for name, value, known in (("cutoff", cutoff, CUTOFFS), ("jacobian", jacobian, JACOBIANS)):
@@ -256,7 +276,7 @@ def _check_rows(rows: dict[str, Tensor]) -> None:
 
 
 def _tiles(n_images, width, height):
-    return n_images * ((width + 15) // 16) * ((height + 15) // 16)
+    return n_images * ((width + TILE - 1) // TILE) * ((height + TILE - 1) // TILE)
 
 
 def sizes_of_state(means: Tensor, n_images: int, n_clouds: int, width: int, height: int) -> tuple[int, int, int]:
@@ -287,7 +307,7 @@ def state_bytes(
 
 @fake("rasterize_gaussians")
 def _(means, quats, scales, opacities, color, features, background, viewmats, *rest):
-    _, _, cu_rows, width, height, _, _, _, *sizes, watch = rest  # Ks, image_cloud, near_plane and modes do not count
+    _, _, cu_rows, width, height, _, _, _, *sizes, watch = rest[:12]  # others do not count
     n_images = viewmats.shape[0]
     shape = (n_images, height, width)
     state = state_bytes(means, n_images, cu_rows.shape[0] - 1, width, height, sizes[0], sizes[2])
@@ -305,15 +325,14 @@ def _(means, quats, scales, opacities, color, features, background, viewmats, *r
 
 @fake("rasterize_gaussians_backward")
 def _(grad_color, grad_alpha, grad_depth, grad_features, transmittance, last, state, *inputs):
-    *inputs, viewmats_grad = inputs
-    shapes = [x.shape for x in inputs[:7]] + [(inputs[7].shape[0] if viewmats_grad else 0, 4, 4)]
+    shapes = [x.shape for x in inputs[:7]] + [(inputs[7].shape[0] if inputs[19] else 0, 4, 4)]
     return tuple(inputs[0].new_empty(shape) for shape in shapes)
 
 
 def _setup(ctx, inputs, output):
     ctx.set_materialize_grads(False)  # else what is kept for the backward pass gets a gradient of zeros as large
     ctx.mark_non_differentiable(*output[4:])
-    ctx.save_for_backward(*output[4:7], *inputs[:11])
+    ctx.save_for_backward(*output[4:7], *inputs[:11], *inputs[20:])
     ctx.options = inputs[11:19]
 
 
@@ -326,8 +345,10 @@ def _backward(ctx, *grads):
         for grad, size in zip(grads, sizes, strict=False)
     ]
     viewmats_grad = ctx.needs_input_grad[7]
-    *grads, viewmats = call("rasterize_gaussians_backward", *images, *saved, *ctx.options, viewmats_grad)
-    return (*grads, viewmats if viewmats_grad else None, *[None] * 12)
+    *grads, viewmats = call(
+        "rasterize_gaussians_backward", *images, *saved[:14], *ctx.options, viewmats_grad, *saved[14:]
+    )
+    return (*grads, viewmats if viewmats_grad else None, *[None] * 13)
 
 
 def _folded(size: int, scene: Sequence[Tensor], is_batched: Sequence[bool], options: Sequence) -> tuple[list, list]:
@@ -342,9 +363,18 @@ def _folded(size: int, scene: Sequence[Tensor], is_batched: Sequence[bool], opti
     return rows, [*options[:5], *sizes_of_state(rows[0], size * viewmats.shape[1], size * n_clouds, width, height)]
 
 
+def _folded_masks(size: int, active: Sequence[Tensor | None], is_batched: Sequence[bool]) -> list[Tensor | None]:
+    """The last argument, if it is given, for the images of all scenes."""
+    return [
+        x if x is None else (x if has else x.expand(size, *x.shape)).flatten(0, 1)
+        for x, has in zip(active, is_batched, strict=True)
+    ]
+
+
 def _batched(size, inputs, is_batched):
     rows, options = _folded(size, inputs[:11], is_batched[:11], inputs[11:])
-    *images, state, unusable = call(OP, *rows, *options, inputs[-1])
+    active = _folded_masks(size, inputs[20:], is_batched[20:])
+    *images, state, unusable = call(OP, *rows, *options, inputs[19], *active)
     images = [x.unflatten(0, (size, -1)) for x in images]
     return (*images, state.expand(size, -1), unusable.reshape(size, -1, 2))  # the state is of all of them
 
@@ -357,7 +387,8 @@ def _backward_batched(size, inputs, is_batched):
         (x if has else x.expand(size, *x.shape)).flatten(0, 1) for x, has in zip(inputs[:6], is_batched, strict=False)
     ]
     rows, options = _folded(size, inputs[7:18], is_batched[7:18], inputs[18:])
-    grads = call("rasterize_gaussians_backward", *of_images, inputs[6][0], *rows, *options, inputs[-1])
+    active = _folded_masks(size, inputs[27:], is_batched[27:])
+    grads = call("rasterize_gaussians_backward", *of_images, inputs[6][0], *rows, *options, inputs[26], *active)
     return tuple(x.reshape(size, x.shape[0] // size, *x.shape[1:]) for x in grads)
 
 
@@ -369,38 +400,38 @@ def _(*inputs):
     return (*(x.new_empty(x.shape) for x in inputs[19:23]), *(x.new_empty(x.shape) for x in inputs[:8]))
 
 
-def _tangent(scene, tangents, images, options):
+def _tangent(scene, tangents, images, options, active):
     """What TANGENT says of the 11 tensors of a scene; None: 0."""
     if scene[0].device.type != "cpu":
         said = "is once differentiable on a GPU, in reverse mode; use tensors on the CPU"
         raise GradientError(f"{OP} (order 2): the rasterizer {said}", op=OP, argument=None, order=2)
     along = [torch.zeros_like(x) if t is None or t.shape != x.shape else t for t, x in zip(tangents, scene)]
-    return call(TANGENT, *scene, *along, *images, *options)
+    return call(TANGENT, *scene, *along, *images, *options, *active)
 
 
 def _jvp(inputs, tangents, outputs):
     if tangents[8] is not None:
         raise GradientError(f"{OP}: cameras.Ks has no gradient (order 1)", op=OP, argument="Ks", order=1)
     zeros = [torch.zeros_like(x) for x in outputs[:4]]
-    return (*_tangent(inputs[:11], tangents[:8], zeros, inputs[11:16])[:4], *[None] * 4)
+    return (*_tangent(inputs[:11], tangents[:8], zeros, inputs[11:16], inputs[20:])[:4], *[None] * 4)
 
 
 def _second_setup(ctx, inputs, output):
     ctx.set_materialize_grads(False)
-    ctx.save_for_backward(*inputs[:4], *inputs[7:18])
+    ctx.save_for_backward(*inputs[:4], *inputs[7:18], *inputs[27:])
     ctx.options = inputs[18:23]
 
 
 def _second_backward(ctx, *grads):
     saved = ctx.saved_tensors
-    tangents = _tangent(saved[4:], grads, saved[:4], ctx.options)
-    return (*tangents[:4], None, None, None, *tangents[4:], *[None] * 12)
+    tangents = _tangent(saved[4:15], grads, saved[:4], ctx.options, saved[15:])
+    return (*tangents[:4], None, None, None, *tangents[4:], *[None] * 13)
 
 
 def _second_jvp(inputs, tangents, outputs):
     images = [torch.zeros_like(x) if t is None else t for t, x in zip(tangents[:4], inputs[:4])]
     linear = call("rasterize_gaussians_backward", *images, *inputs[4:])
-    others = _tangent(inputs[7:18], tangents[7:15], inputs[:4], inputs[18:23])[4:]
+    others = _tangent(inputs[7:18], tangents[7:15], inputs[:4], inputs[18:23], inputs[27:])[4:]
     return tuple(a + b if a.shape == b.shape else a for a, b in zip(linear, others, strict=True))
 
 

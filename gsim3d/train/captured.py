@@ -306,11 +306,13 @@ class _Step:
         particles = concatenate([state, *self._rollout(state, geometry, report, with_own_weights)])
         with owner.precision("renderer"):
             shown = {"plan": owner.plan, "report": report, "on_invalid": "drop"}
-            draw = owner.again("images")(lambda p, cameras: owner.simulator._draw(p, cameras, **shown).color)
+            draw = owner.again("images")(
+                lambda p, cameras, valid: owner.simulator._draw(p, cameras, active=valid, **shown).color
+            )
             if owner.leaves_out:
-                images = draw_left_out(draw, particles, self._targets.cameras, images_per_cloud(self._context))
+                images = draw_left_out(draw, particles, self._targets, images_per_cloud(self._context))
             else:
-                images = draw(particles, self._targets.cameras)
+                images = draw(particles, self._targets.cameras, self._targets.valid)
         report.close()  # recomputation in the backward pass must not count again
         loss, errors = owner.loss(images, self._targets, self._weights)
         once = [*owner.simulator.encoder.parameters(), *owner.simulator.renderer.parameters()]

@@ -32,14 +32,14 @@ def images_per_cloud(frames: Frames) -> int:
 
 
 def draw_left_out(
-    draw: Callable[[Particles, Cameras], Tensor], particles: Particles, cameras: Cameras, n_views: int
+    draw: Callable[[Particles, Cameras, Tensor | None], Tensor], particles: Particles, targets: Frames, n_views: int
 ) -> Tensor:
     """Draws each image without the particles that came from its own camera.
 
     Args:
-        draw: function (particles, cameras) -> images [I, H, W, 3].
+        draw: function (particles, cameras, valid) -> images [I, H, W, 3].
         particles: particles with ``view``; those of left-out views have opacity 0.
-        cameras: I cameras, ``n_views`` for each cloud, in the order of the input images.
+        targets: frames of I cameras, ``n_views`` for each cloud, in the order of the input images.
         n_views: input images of each cloud.
 
     Returns:
@@ -48,9 +48,11 @@ def draw_left_out(
     Gradients:
         Exactly 0 from an image to the particles of its own camera.
     """
-    images, number = [], torch.arange(len(cameras), device=particles.means.device).view(-1, n_views)
+    images, cameras, valid = [], targets.cameras, targets.valid
+    number = torch.arange(len(cameras), device=particles.means.device).view(-1, n_views)
     for view in range(n_views):
         opacities = particles.opacities.masked_fill(particles.view == view, 0)
         others = dataclasses.replace(particles, opacities=opacities)
-        images.append(draw(others, cameras.select(number[:, view])))
+        chosen = number[:, view]
+        images.append(draw(others, cameras.select(chosen), None if valid is None else valid[chosen]))
     return torch.stack(images, 1).flatten(0, 1)

@@ -431,11 +431,11 @@ class Trainer:
             particles = concatenate([particles, *steps])
         draw = {"plan": self.plan, **options}
         with precision.of("renderer", self.device):
-            render = again("images")(lambda p, cameras: simulator.render(p, cameras, **draw).color)
+            render = again("images")(lambda p, cameras, valid: simulator.render(p, cameras, active=valid, **draw).color)
             if self.config.data.leave_one_out:
-                images = draw_left_out(render, particles, batch.targets.cameras, images_per_cloud(batch.context))
+                images = draw_left_out(render, particles, batch.targets, images_per_cloud(batch.context))
             else:
-                images = render(particles, batch.targets.cameras)
+                images = render(particles, batch.targets.cameras, batch.targets.valid)
         watch.report.close()  # recomputation in the backward pass must not count again
         return images
 

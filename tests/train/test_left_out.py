@@ -52,9 +52,9 @@ def test_no_gradient_to_particles_of_the_target_camera(trainer):
     particles = dataclasses.replace(particles, means=leaf)
     views = images_per_cloud(batch.context)
     images = draw_left_out(
-        lambda p, cameras: simulator.render(p, cameras, plan=trainer.plan).color,
+        lambda p, cameras, valid: simulator.render(p, cameras, plan=trainer.plan, active=valid).color,
         particles,
-        batch.targets.cameras,
+        batch.targets,
         views,
     )
     for view in range(3):
@@ -69,6 +69,32 @@ def test_particles_know_the_image_they_come_from(trainer):
     counts = frames.masks.flatten(1).sum(1).view(-1, 3)
     expected = torch.cat([torch.arange(3).repeat_interleave(row) for row in counts])
     assert state.view.tolist() == expected.tolist()
+
+
+@pytest.mark.parametrize("leaves_out", [False, True])
+def test_tiles_outside_of_the_mask_are_not_drawn(trainer, leaves_out, monkeypatch):
+    batch = trainer._batch([0, 1])
+    valid = torch.zeros(batch.targets.images[:, 0].shape, dtype=torch.bool)
+    valid[:, :10, :20] = True
+    batch = dataclasses.replace(batch, targets=dataclasses.replace(batch.targets, valid=valid))
+    config = dataclasses.replace(CONFIG, data=dataclasses.replace(CONFIG.data, leave_one_out=leaves_out))
+    monkeypatch.setattr(trainer, "config", config)
+    render, parameters, drawn = trainer.simulator.render, list(trainer.parameters.values()), []
+
+    def loss(with_mask):
+        def spied(*arguments, active, **options):
+            image = render(*arguments, active=active if with_mask else None, **options)
+            drawn.append((image.color > 0).sum().item())
+            return image
+
+        monkeypatch.setattr(trainer.simulator, "render", spied)
+        value, errors = trainer.loss(batch)
+        return value, errors, *torch.autograd.grad(value, parameters, materialize_grads=True)
+
+    masked, whole = loss(True), loss(False)
+    assert sum(drawn[: len(drawn) // 2]) < 0.8 * sum(drawn[len(drawn) // 2 :])
+    for a, e in zip(masked, whole, strict=True):
+        assert torch.equal(a, e)
 
 
 def test_captured_loss_leaves_out_the_same_particles(trainer):

@@ -57,6 +57,8 @@ struct RasterScene {
   const T* means2d = nullptr;  // [n_rows, 2] pixels
   const T* conics = nullptr;   // [n_rows, 3] xx, xy, yy of the inverse covariance, px^-2
   const T* depths = nullptr;   // [n_rows] metres
+  // [n_images, tiles] of kTile x kTile pixels, row by row: where false, the background alone is shown. Null: all true.
+  const bool* active = nullptr;
 };
 
 // What makes a row unusable; bits. Such a row is left out of the images, and its gradients are 0.

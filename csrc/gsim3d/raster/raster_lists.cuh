@@ -175,6 +175,7 @@ struct Job {
   Entry<T>* entries;       // [entries]
   Entry<T>* spare;         // [entries]
 
+  __device__ bool is_active(int64_t tile) const { return !scene.active || scene.active[tile]; }
   // Slots of an image begin behind those of the images before it in the group.
   __device__ uint32_t first_slot(int64_t image, const Group& in) const {
     return in.in_parts ? 0 : static_cast<uint32_t>(slot_count[image]);

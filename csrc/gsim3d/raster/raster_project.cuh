@@ -122,17 +122,18 @@ class SharedRows {
 template <int kTerms>
 constexpr int kColorColumns = kTerms > 0 ? kTerms * 3 : 3;
 
-// Counts the entries of every tile that the bounds of a warp touch.
+// Counts the entries of every active tile of an image that the bounds of a warp touch.
 template <typename T>
-__device__ void count_tiles(const Job<T>& job, uint32_t* counts, const PixelRect& bounds, Walked<Nothing>* memory) {
+__device__ void count_tiles(const Job<T>& job, int64_t image, const PixelRect& bounds, Walked<Nothing>* memory) {
+  const int64_t first_tile = image * job.n_tiles;
   WarpTiles<Nothing> tiles(bounds, memory);
   tiles.share({});
   for (int base = 0; base < tiles.total; base += kWarp) {
     const auto place = tiles.at(base);
     const auto tile = static_cast<uint32_t>(place.y * job.tiles_x + place.x);
-    const unsigned same = tiles.lanes_of(tile, place.used);
+    const unsigned same = tiles.lanes_of(tile, place.used && job.is_active(first_tile + tile));
     if (__ffs(same) - 1 == static_cast<int>(threadIdx.x % kWarp))
-      atomicAdd(counts + tile, static_cast<uint32_t>(__popc(same)));
+      atomicAdd(job.cursor + first_tile + tile, static_cast<uint32_t>(__popc(same)));
   }
 }
 
@@ -173,7 +174,7 @@ __device__ void project_rows(const Job<T>& job, unsigned char* memory) {
         if (bounds.x0 < bounds.x1) store_record(record, job.records + pair), job.depths[pair] = record.z;
       }
       if (rows.inside) job.bounds[pair] = bounds;
-      count_tiles(job, job.cursor + image * job.n_tiles, bounds, walked + threadIdx.x / kWarp * kWarp);
+      count_tiles(job, image, bounds, walked + threadIdx.x / kWarp * kWarp);
       const uint32_t slots = __reduce_add_sync(kFullWarp, static_cast<uint32_t>(squares_of(bounds, kQuarter).count()));
       if (lane == 0 && slots) atomicAdd(job.slot_count + image, static_cast<unsigned long long>(slots));
     }

@@ -127,11 +127,14 @@ void read_chunk(const RasterScene<T>& scene, const Chunk& chunk, Splat<T>* splat
   }
 }
 
-// Calls f(tile) for every tile with a pixel that may see the splat, row by row. A row of tiles is cut to the columns
-// between the leftmost and the rightmost point of the ellipse within it.
+// Calls f(tile) for every active tile with a pixel that may see the splat, row by row. A row of tiles is cut to the
+// columns between the leftmost and the rightmost point of the ellipse within it. `active`: of the image, or null.
 template <typename T, typename F>
-void for_tiles(const Splat<T>& splat, int64_t tiles_x, const F& f) {
+void for_tiles(const Splat<T>& splat, int64_t tiles_x, const bool* active, const F& visit) {
   if (splat.bounds.x0 >= splat.bounds.x1) return;
+  const auto f = [&](int64_t tile) {
+    if (!active || active[tile]) visit(tile);
+  };
   const int64_t tx0 = splat.bounds.x0 / kTile, tx1 = (splat.bounds.x1 - 1) / kTile;
   const int64_t ty0 = splat.bounds.y0 / kTile, ty1 = (splat.bounds.y1 - 1) / kTile;
   if (tx0 == tx1 || ty0 == ty1) {
@@ -157,6 +160,11 @@ void for_tiles(const Splat<T>& splat, int64_t tiles_x, const F& f) {
     if (begin >= end) continue;
     for (int64_t tx = begin / kTile; tx <= (end - 1) / kTile; ++tx) f(ty * tiles_x + tx);
   }
+}
+
+template <typename T>
+const bool* active_tiles(const RasterScene<T>& scene, const Group<T>& group, int64_t image) {
+  return scene.active ? scene.active + image * group.n_tiles() : nullptr;
 }
 
 template <typename T>
@@ -224,7 +232,7 @@ bool next_group(const RasterScene<T>& scene, bool backward, Scratch& scratch, co
     std::fill_n(counts, n_tiles, int64_t{0});
     for (int64_t i = 0; i < chunk.end - chunk.begin; ++i) {
       int64_t count = 0;
-      for_tiles(splats[i], group.tiles_x, [&](int64_t tile) { ++counts[tile], ++count; });
+      for_tiles(splats[i], group.tiles_x, active_tiles(scene, group, chunk.image), [&](int64_t tile) { ++counts[tile], ++count; });
       if (backward) group.pair_begin[chunk.pair + i + 1] = count;
     }
   });
@@ -273,7 +281,7 @@ bool next_group(const RasterScene<T>& scene, bool backward, Scratch& scratch, co
       Instance<T> instance{0, static_cast<uint32_t>(pair - first_pair)};
       std::memcpy(&instance.key, &splat.z, sizeof(T));
       int64_t* positions = backward ? group.positions + group.pair_begin[pair] : nullptr;
-      for_tiles(splat, group.tiles_x, [&](int64_t tile) {
+      for_tiles(splat, group.tiles_x, active_tiles(scene, group, chunk.image), [&](int64_t tile) {
         if (positions) *positions++ = cursor[tile];
         group.instances[cursor[tile]++] = instance;
       });

@@ -174,7 +174,8 @@ __device__ void scatter_rows(const Job<T>& job) {
               tiles.many() ? owner.ellipse.touched(place.quarters, place.x, place.y) : place.quarters;
           entry[k] = Entry<T>::make(owner.z, word_of(owner.pair, quarters));
           const auto tile = static_cast<uint32_t>(place.y * job.tiles_x + place.x);
-          same[k] = tiles.lanes_of(tile, place.used && group.has(first_tile + tile));
+          same[k] = tiles.lanes_of(
+              tile, place.used && group.has(first_tile + tile) && job.is_active(first_tile + tile));
           if (__ffs(same[k]) - 1 == lane)
             position[k] = atomicAdd(job.cursor + first_tile + tile, static_cast<uint32_t>(__popc(same[k])));
         }

@@ -1,7 +1,9 @@
+#include <optional>
 #include <tuple>
 #include <vector>
 
 #include "gsim3d/raster/raster.h"
+#include "gsim3d/raster/raster_math.h"
 #include "gsim3d/torch/raster_image_grads.h"
 #include "gsim3d/torch/torch_utils.h"
 
@@ -15,12 +17,14 @@ struct SceneTensors {
   int64_t width, height;
   double near_plane;
   int64_t cutoff, jacobian;
+  std::optional<Tensor> active;
 
   SceneTensors contiguous() const {
     SceneTensors copy = *this;
     for (Tensor* tensor : {&copy.means, &copy.quats, &copy.scales, &copy.opacities, &copy.color, &copy.features,
                            &copy.background, &copy.viewmats, &copy.Ks, &copy.image_cloud, &copy.cu_rows})
       *tensor = rows_of(*tensor);
+    if (active) copy.active = rows_of(*active);
     return copy;
   }
 
@@ -62,6 +66,12 @@ struct SceneTensors {
              {"background", background}, {"viewmats", viewmats}, {"Ks", Ks}, {"image_cloud", image_cloud},
              {"cu_rows", cu_rows}})
       check_device(op, name, tensor, means);
+    if (!active) return;
+    using raster::kTile;
+    check_shape(op, "active", *active, {images, (height + kTile - 1) / kTile, (width + kTile - 1) / kTile},
+                "[I, tiles by column, tiles by row]");
+    check_dtype(op, "active", *active, ScalarType::Bool);
+    check_device(op, "active", *active, means);
   }
 
   template <typename T>
@@ -86,7 +96,8 @@ struct SceneTensors {
             .height = height,
             .near_plane = static_cast<T>(near_plane),
             .cutoff = static_cast<RasterCutoff>(cutoff),
-            .jacobian = static_cast<RasterJacobian>(jacobian)};
+            .jacobian = static_cast<RasterJacobian>(jacobian),
+            .active = active ? data<bool>(*active) : nullptr};
   }
 };
 
@@ -96,9 +107,10 @@ Images rasterize_gaussians(const Tensor& means, const Tensor& quats, const Tenso
                            const Tensor& color, const Tensor& features, const Tensor& background,
                            const Tensor& viewmats, const Tensor& Ks, const Tensor& image_cloud, const Tensor& cu_rows,
                            int64_t width, int64_t height, double near_plane, int64_t cutoff, int64_t jacobian,
-                           int64_t max_pairs, int64_t max_entries, int64_t max_slots, bool watch) {
+                           int64_t max_pairs, int64_t max_entries, int64_t max_slots, bool watch,
+                           const std::optional<Tensor>& active) {
   const SceneTensors given{"rasterize_gaussians", means, quats, scales, opacities, color, features, background,
-                           viewmats, Ks, image_cloud, cu_rows, width, height, near_plane, cutoff, jacobian};
+                           viewmats, Ks, image_cloud, cu_rows, width, height, near_plane, cutoff, jacobian, active};
   given.check_all();
   const SceneTensors in = given.contiguous();
   const int64_t n = in.n_images();
@@ -141,10 +153,11 @@ SceneGrads rasterize_gaussians_backward(const Tensor& grad_color, const Tensor& 
                                         const Tensor& background, const Tensor& viewmats, const Tensor& Ks,
                                         const Tensor& image_cloud, const Tensor& cu_rows, int64_t width, int64_t height,
                                         double near_plane, int64_t cutoff, int64_t jacobian, int64_t max_pairs,
-                                        int64_t max_entries, int64_t max_slots, bool viewmats_grad) {
+                                        int64_t max_entries, int64_t max_slots, bool viewmats_grad,
+                                        const std::optional<Tensor>& active) {
   const char* op = "rasterize_gaussians_backward";
   const SceneTensors given{op, means, quats, scales, opacities, color, features, background,
-                           viewmats, Ks, image_cloud, cu_rows, width, height, near_plane, cutoff, jacobian};
+                           viewmats, Ks, image_cloud, cu_rows, width, height, near_plane, cutoff, jacobian, active};
   given.check_all();
   const SceneTensors in = given.contiguous();
   const int64_t n = in.n_images();
@@ -189,10 +202,10 @@ Tangents rasterize_gaussians_backward_tangent(
     const Tensor& t_scales, const Tensor& t_opacities, const Tensor& t_color, const Tensor& t_features,
     const Tensor& t_background, const Tensor& t_viewmats, const Tensor& grad_color, const Tensor& grad_alpha,
     const Tensor& grad_depth, const Tensor& grad_features, int64_t width, int64_t height, double near_plane,
-    int64_t cutoff, int64_t jacobian) {
+    int64_t cutoff, int64_t jacobian, const std::optional<Tensor>& active) {
   const char* op = "rasterize_gaussians_backward_tangent";
   const SceneTensors given{op, means, quats, scales, opacities, color, features, background,
-                           viewmats, Ks, image_cloud, cu_rows, width, height, near_plane, cutoff, jacobian};
+                           viewmats, Ks, image_cloud, cu_rows, width, height, near_plane, cutoff, jacobian, active};
   const Tensor* tangents_[] = {&t_means, &t_quats, &t_scales, &t_opacities, &t_color, &t_features, &t_background,
                                &t_viewmats};
   const Tensor* image_grads_[] = {&grad_color, &grad_alpha, &grad_depth, &grad_features};

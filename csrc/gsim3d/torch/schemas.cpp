@@ -137,13 +137,13 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
   // raster: 3D Gaussian projection and blending. color is [N, K, 3] SH coefficients or [N, 3]; cutoff 0 exact, 1
   // tile3sigma, 2 smooth; jacobian 0 exact, 1 clamped; transmittance, last and state are kept for the backward pass.
   // max_* (CUDA) size the state.
+  // active: bool [I, tiles, tiles] of 16 x 16 pixels; the others show the background alone.
   // unusable [I, 2] counts the rows that were left out, [0, 2] unless `watch`.
   m.def(
       "rasterize_gaussians(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor color, Tensor features, "
       "Tensor background, Tensor viewmats, Tensor Ks, Tensor image_cloud, Tensor cu_rows, int width, int height, "
-      "float near_plane, int cutoff, int jacobian, SymInt max_pairs, SymInt max_entries, SymInt max_slots, bool watch) "
-      "-> "
-      "(Tensor color, Tensor alpha, Tensor depth, Tensor features, Tensor transmittance, Tensor last, Tensor state, "
+      "float near_plane, int cutoff, int jacobian, SymInt max_pairs, SymInt max_entries, SymInt max_slots, bool watch, "
+      "Tensor? active=None) -> (Tensor color, Tensor alpha, Tensor depth, Tensor features, Tensor transmittance, Tensor last, Tensor state, "
       "Tensor unusable)");
   m.def(
       "rasterize_gaussians_backward(Tensor grad_color, Tensor grad_alpha, Tensor grad_depth, Tensor grad_features, "
@@ -151,7 +151,7 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "Tensor color, Tensor features, Tensor background, Tensor viewmats, Tensor Ks, Tensor image_cloud, Tensor "
       "cu_rows, "
       "int width, int height, float near_plane, int cutoff, int jacobian, SymInt max_pairs, SymInt max_entries, SymInt "
-      "max_slots, bool viewmats_grad) -> (Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor color, "
+      "max_slots, bool viewmats_grad, Tensor? active=None) -> (Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor color, "
       "Tensor features, Tensor background, Tensor viewmats)");
 
   // Derivatives along the tangents t_*, on the CPU: of the four images, and of all gradients that those of images give.
@@ -160,7 +160,8 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "Tensor features, Tensor background, Tensor viewmats, Tensor Ks, Tensor image_cloud, Tensor cu_rows, Tensor "
       "t_means, Tensor t_quats, Tensor t_scales, Tensor t_opacities, Tensor t_color, Tensor t_features, Tensor "
       "t_background, Tensor t_viewmats, Tensor grad_color, Tensor grad_alpha, Tensor grad_depth, Tensor grad_features, "
-      "int width, int height, float near_plane, int cutoff, int jacobian) -> (Tensor color, Tensor alpha, Tensor depth, "
+      "int width, int height, float near_plane, int cutoff, int jacobian, Tensor? active=None) -> (Tensor color, Tensor "
+      "alpha, Tensor depth, "
       "Tensor features, Tensor grad_means, Tensor grad_quats, Tensor grad_scales, Tensor grad_opacities, Tensor "
       "grad_in_color, Tensor grad_in_features, Tensor grad_background, Tensor grad_viewmats)");
 
