@@ -139,8 +139,27 @@ def gpu(bench):
     gpu_case(bench, peer, "1 view, 1080p, 1M, SH0", large, sh_of(large, 0, 5), target(2.5, 0.126, 0.413))
 
 
+def masked(bench):
+    """A loss of the left half of every image, as of frames padded to the size of others: its tiles alone, and all."""
+    scene = pixel_aligned_scene(4, SIZE, 9, 11, bench.device) if bench.device.type == "cuda" else None
+    scene = scene or pixel_aligned_scene(IMAGES, SIZE, 1, 13, bench.device, context=1)
+    cameras, cu_rows = packed(scene)
+    rows = [scene[key].flatten(0, 1) for key in ("means", "quats", "scales", "opacities")]
+    leaves = [x.requires_grad_() for x in (*rows, sh_of(scene, 0, 7).flatten(0, 1))]
+    half = torch.zeros(len(cameras), SIZE, SIZE, dtype=torch.bool, device=bench.device)
+    half[:, :, : SIZE // 2] = True
+
+    def step(active):
+        image = rasterize_gaussians(*leaves[:4], cameras, sh=leaves[4], cu_rows=cu_rows, active=active).color
+        loss = ((image - 0.5).square().mean(-1) * half).sum()
+        return [loss.detach(), *torch.autograd.grad(loss, leaves)]
+
+    bench.cost("loss of half of the pixels: fwd+bwd", lambda: step(half), lambda: step(None))
+
+
 def main():
     bench = Bench("raster")
+    masked(bench)
     if bench.device.type == "cuda":
         gpu(bench)
         return bench.finish()
