@@ -261,7 +261,7 @@ def _check_choices(
     name, color, shape = ("sh", sh, "[N, K, 3]") if colors is None else ("colors", colors, "[N, 3]")
     if color.dim() != shape.count(",") + 1:
         raise ValueError(f"rasterize_gaussians: {name} must be {shape}; got {list(color.shape)}")
-    return name, color
+    return name, color  # type: ignore[return-value]  # one of them is given
 
 
 def _check_rows(rows: dict[str, Tensor]) -> None:
