@@ -77,19 +77,16 @@ class Graph:
             newest_only: leaves out senders of earlier steps.
         """
         voxels, taps = stage.voxels, stage.kernel_maps[KERNEL]
-        nodes = torch.arange(stage.n_rows, device=positions.device)
-        cells = torch.arange(voxels.cu_rows.shape[0] - 1, device=nodes.device)
-        slots, slot = (1, 0) if stage.time_index is None else (longest, stage.time_index)
-        nowhere = nodes.new_full((cells.shape[0] * slots,), stage.n_rows)
-        node_at = nowhere.index_copy(0, voxels.row_voxel * slots + slot, nodes).view(-1, slots)
+        cells = torch.arange(voxels.cu_rows.shape[0] - 1, device=positions.device)
+        node_at = _nodes_by_slot(stage, cells, longest if stage.time_index is not None else 1)
         seen = node_at[:, -1:] if newest_only else node_at
         senders = seen[torch.cat([taps.tap_in, cells])]
         receivers = node_at[torch.cat([taps.tap_out, cells]), -1:].expand_as(senders)
         at = F.pad(positions.detach(), (0, 0, 0, 1), value=torch.nan)  # of a node that is not there
         joined = (at[senders] - at[receivers]).square().sum(-1) <= RADIUS**2
-        is_pair = torch.arange(taps.tap_in.shape[0], device=nodes.device) < taps.cu_taps[-1]
+        is_pair = torch.arange(taps.tap_in.shape[0], device=cells.device) < taps.cu_taps[-1]
         joined &= F.pad(is_pair, (0, cells.shape[0]), value=True)[:, None]
-        age = torch.arange(seen.shape[1] - 1, -1, -1, device=nodes.device).expand_as(senders)
+        age = torch.arange(seen.shape[1] - 1, -1, -1, device=cells.device).expand_as(senders)
         senders, receivers = (torch.where(joined, ends, stage.n_rows).flatten() for ends in (senders, receivers))
         order, _ = ops.curve_sort(receivers[None])
         age = age.reshape(-1, 1)[order[0]].to(positions) / longest
@@ -107,6 +104,19 @@ class Graph:
         """[E, 5]: difference of positions, its square, age."""
         apart = (self.from_senders(positions) - self.from_receivers(positions)) / RADIUS
         return torch.cat([apart, apart.square().sum(1, keepdim=True), self.age], 1)
+
+
+def _nodes_by_slot(stage: Stage, cells: Tensor, slots: int) -> Tensor:
+    """The node of each cell and time slot, int64 [V, slots]; one more than the last: there is none.
+
+    A search among the nodes, which ascend by cell and slot: on CUDA torch's deterministic scatter waits for the device.
+    """
+    voxels, slot = stage.voxels, 0 if stage.time_index is None else stage.time_index
+    known = (voxels.row_voxel * slots + slot)[voxels.rows]
+    wanted = (cells[:, None] * slots + torch.arange(slots, device=cells.device)).contiguous()
+    place = torch.searchsorted(known, wanted)
+    known, nodes = F.pad(known, (0, 1), value=-1), F.pad(voxels.rows, (0, 1))
+    return torch.where(known[place] == wanted, nodes[place], stage.n_rows)
 
 
 def _ends(nodes: Tensor, n_nodes: int) -> Segments:
