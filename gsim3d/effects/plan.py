@@ -213,7 +213,7 @@ def _graph(config: DynamicsConfig, inputs: int, outputs: int, particles: float, 
     """Multiply-adds of a graph network on ``particles``, each a node, of which ``newest`` receive edges."""
     width, layers, neighbours = config.graph.channels, config.graph.layers, KERNEL**SURFACE
     dense = particles * (inputs + (4 + 5 * (1 + layers)) * width) + newest * (width + outputs)
-    return float((dense + neighbours * (3 * particles + (1 + 2 * layers) * newest) * width) * width)
+    return float((dense + neighbours * (3 * (particles - newest) + (1 + 2 * layers) * newest) * width) * width)
 
 
 def _block(config: DynamicsConfig, particles: float, context: float, channels: int, patch: int) -> float:

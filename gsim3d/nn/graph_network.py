@@ -1,8 +1,8 @@
 """A graph network over packed point clouds of several time steps, in place of the point transformer.
 
 The particles of a step that share a cell of the grid are one node, at their mean position. To each node of the newest
-step lead edges from all nodes less than RADIUS cells away: in a first round of message passing from those of every
-step of the history, in later rounds from those of the newest. Positions enter as differences only.
+step lead edges from all nodes in its cell and those around: in a first round of message passing from those of earlier
+steps, in later rounds from those of the newest. Positions enter as differences only.
 Source:
     Graph Network-based Simulators (Sanchez-Gonzalez et al. 2020), with the interaction of nodes and edges of Battaglia
     et al. 2018.
@@ -25,15 +25,14 @@ from gsim3d.nn.layers import RowLayerNorm, RowLinear
 from gsim3d.nn.point_transformer import COLUMN_MULTIPLE, Extension, Head, TransformerConfig
 from gsim3d.ops.curve import Pyramid, PyramidSpec, Segments, Stage
 
-RADIUS = 2.0  # of the graph, in cells
-KERNEL = 5  # edge in cells of the cube around a cell that has all nodes within RADIUS
+KERNEL = 3  # edge in cells of the cube around a node whose nodes it reads
 PATCH = 1024  # no patch is read, and a few are made sooner than many
 MAX_HISTORY_BITS = 5  # edges to a node grow with the steps of a history
 
 
 @dataclass(frozen=True, kw_only=True)
 class GraphConfig:
-    """Size of a :class:`GraphNetwork`. A node is a cell of ``grid_size``; the radius of the graph is twice that.
+    """Size of a :class:`GraphNetwork`. A node is a cell of ``grid_size``, with edges to the 27 cells around it.
 
     Attributes:
         channels: of a node, and of an edge.
@@ -67,29 +66,28 @@ class Graph:
     age: Tensor
 
     @classmethod
-    def of(cls, positions: Tensor, stage: Stage, longest: int, *, newest_only: bool) -> Graph:
+    def of(cls, stage: Stage, longest: int, like: Tensor, *, earlier: bool) -> Graph:
         """Joins the nodes of ``stage``, without a device sync.
 
         Args:
-            positions: of the nodes [N, 3], in cells.
             stage: geometry of the nodes.
             longest: steps of the longest history.
-            newest_only: leaves out senders of earlier steps.
+            like: has the dtype of ``age``.
+            earlier: senders are the nodes of earlier steps, or else those of the newest.
         """
         voxels, taps = stage.voxels, stage.kernel_maps[KERNEL]
-        cells = torch.arange(voxels.cu_rows.shape[0] - 1, device=positions.device)
+        cells = torch.arange(voxels.cu_rows.shape[0] - 1, device=like.device)
         node_at = _nodes_by_slot(stage, cells, longest if stage.time_index is not None else 1)
-        seen = node_at[:, -1:] if newest_only else node_at
-        senders = seen[torch.cat([taps.tap_in, cells])]
+        steps = slice(None, -1) if earlier else slice(-1, None)
+        senders = node_at[:, steps][torch.cat([taps.tap_in, cells])]
         receivers = node_at[torch.cat([taps.tap_out, cells]), -1:].expand_as(senders)
-        at = F.pad(positions.detach(), (0, 0, 0, 1), value=torch.nan)  # of a node that is not there
-        joined = (at[senders] - at[receivers]).square().sum(-1) <= RADIUS**2
         is_pair = torch.arange(taps.tap_in.shape[0], device=cells.device) < taps.cu_taps[-1]
-        joined &= F.pad(is_pair, (0, cells.shape[0]), value=True)[:, None]
-        age = torch.arange(seen.shape[1] - 1, -1, -1, device=cells.device).expand_as(senders)
+        joined = F.pad(is_pair, (0, cells.shape[0]), value=True)[:, None]
+        joined = joined & (senders < stage.n_rows) & (receivers < stage.n_rows)
+        age = torch.arange(node_at.shape[1], device=cells.device).flip(0)[steps].expand_as(senders)
         senders, receivers = (torch.where(joined, ends, stage.n_rows).flatten() for ends in (senders, receivers))
         order, _ = ops.curve_sort(receivers[None])
-        age = age.reshape(-1, 1)[order[0]].to(positions) / longest
+        age = age.reshape(-1, 1)[order[0]].to(like) / longest
         return cls(_ends(senders[order[0]], stage.n_rows), _ends(receivers[order[0]], stage.n_rows), age)
 
     def from_senders(self, x: Tensor) -> Tensor:
@@ -102,7 +100,7 @@ class Graph:
 
     def features(self, positions: Tensor) -> Tensor:
         """[E, 5]: difference of positions, its square, age."""
-        apart = (self.from_senders(positions) - self.from_receivers(positions)) / RADIUS
+        apart = self.from_senders(positions) - self.from_receivers(positions)
         return torch.cat([apart, apart.square().sum(1, keepdim=True), self.age], 1)
 
 
@@ -193,9 +191,9 @@ class GraphNetwork(nn.Module):
         nodes = ops.pool_mean(x, rows, cu_rows, check=False)
         again = self.checkpointing and self.training and torch.is_grad_enabled()
         run = partial(checkpoint, use_reentrant=False, preserve_rng_state=False) if again else _call
-        graph = Graph.of(at, stage, self.longest, newest_only=False)
+        graph = Graph.of(stage, self.longest, at, earlier=True)
         nodes, _ = run(self.history, nodes, self.history_edge(graph.features(at)), graph)
-        graph = Graph.of(at, stage, self.longest, newest_only=True)
+        graph = Graph.of(stage, self.longest, at, earlier=False)
         edges = self.edge(graph.features(at))
         for layer in self.layers:
             nodes, edges = run(layer, nodes, edges, graph)
