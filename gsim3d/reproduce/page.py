@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from gsim3d.evaluate.compare import LEAST, paired
 from gsim3d.evaluate.pictures import pyplot, save_figure, write_curves
-from gsim3d.evaluate.report import facts, physics_table, summarize, write_json
+from gsim3d.evaluate.report import facts, notes, physics_table, summarize, write_json
 from gsim3d.evaluate.scoring import METRICS, measurable
 from gsim3d.io.files import with_parents, write_whole
 from gsim3d.reproduce.cells import from_json
@@ -76,7 +76,7 @@ def write(out: Path, rows: Sequence[Row], about: dict) -> tuple[dict, list[Path]
         if table == MAIN:
             _add_times(own, [row for row in rows if (row.table, row.world) == (SPEED, world)])
         pictures = _figures(out / "figures", table, world, own)
-        parts += [f"## {table}: {world}", "" if table == EDITS else _table(own), _physics(own) if table == MAIN else ""]
+        parts += [f"## {table}: {world}", "" if table == EDITS else _table(own), _remarks(own) if table == MAIN else ""]
         parts += [f"![{path.stem}](figures/{path.name})" for path in pictures]
         files += pictures
         lines += own
@@ -113,7 +113,7 @@ def _lines(rows: Sequence[Row]) -> list[Line]:
 def _line(row: Row, method: str = "") -> Line:
     """The line of a row; with ``method`` that of a baseline in its cells."""
     numbers, by_scene, summary = _numbers(row.cells, method)
-    line = Line(row, method.replace("_", " ") or row.label, numbers, by_scene, summary)
+    line = Line(row, method or row.label, numbers, by_scene, summary)
     change = _difference(line, _numbers(row.before, method)[1]) if row.before else None
     line.last = change and change[0]
     return line
@@ -197,8 +197,10 @@ def _merged(lines: Sequence[Line]) -> dict:
     return {**merged, "methods": [line.label for line in lines], "physics": {**truth, **physics}}
 
 
-def _physics(lines: Sequence[Line]) -> str:
-    return "\n".join([*facts(lines[0].summary), *physics_table(_merged(lines))])
+def _remarks(lines: Sequence[Line]) -> str:
+    """Caveats of the main table, and the physical measures of its methods."""
+    first = lines[0].summary
+    return "\n".join([f"{text}\n" for text in [*facts(first), *notes(first)]] + physics_table(_merged(lines))[1:])
 
 
 def _figures(folder: Path, table: str, world: str, lines: Sequence[Line]) -> list[Path]:
@@ -209,17 +211,19 @@ def _figures(folder: Path, table: str, world: str, lines: Sequence[Line]) -> lis
         return []
     curves = folder / f"{table} {world} curves.png".lower().replace(" ", "-")
     write_curves(with_parents(curves), _merged(lines), None, CURVES)
-    timed = [line for line in lines if table == MAIN and _seconds(line) is not None]
-    if not timed:
+    if table != MAIN or all(_seconds(line) is None for line in lines):
         return [curves]
-    plt, file = pyplot(), folder / f"accuracy-against-time-{world}.png"
-    figure, axes = plt.subplots(figsize=(5, 3.8), layout="constrained")
-    for line in timed:
-        value = statistics.fmean(value for value in line.by_scene.values() if value is not None)
-        axes.plot(_seconds(line), value, "o")
-        axes.annotate(line.label, (_seconds(line), value), (5, 4), textcoords="offset points", fontsize=8)
+    file = folder / f"accuracy-against-time-{world}.png"
+    figure, axes = pyplot().subplots(figsize=(6, 4), layout="constrained")
+    for k, line in enumerate(lines):
+        value, seconds = line.numbers.get("future.psnr_masked", line.numbers.get("future.psnr")), _seconds(line)
+        if seconds is None:  # a baseline without a time of its own
+            axes.axhline(value, color=f"C{k}", linestyle="--", linewidth=1, label=line.label)
+        else:
+            axes.plot(seconds, value, "o", color=f"C{k}", label=line.label)
     axes.set(xscale="log", xlabel="seconds a predicted step (fits: all of it)", ylabel="PSNR masked, dB", title=world)
     axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
     save_figure(figure, file)
     return [curves, file]
 

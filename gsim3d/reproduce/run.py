@@ -19,6 +19,7 @@ from gsim3d.errors import CaptureError, FitWarning, InputError, NumericalError
 from gsim3d.evaluate.ablations import Study, base_run, load_ablations
 from gsim3d.evaluate.pictures import pyplot
 from gsim3d.evaluate.protocol import default_views
+from gsim3d.evaluate.scoring import measurable
 from gsim3d.io.files import output_path, sha256_of
 from gsim3d.io.locks import only_one_writer
 from gsim3d.io.machine import machine
@@ -211,6 +212,7 @@ class _Run:
             "scene": sha256_of(file) if file.is_file() else str(folder),
             "targets": list(targets),
             "steps": job.steps,
+            "metrics": list(measurable()[0]) if row.table == MAIN else None,
         }
         cost = self._costs.get((entry.table, entry.row), 0)
         self._measure(row, scene, asked, run, needs or (NO_TIME if time.monotonic() + cost > self._end else None))

@@ -1,9 +1,11 @@
 """The page of the paper's tables: measured within a budget, continued, compared with the last run."""
 
+import dataclasses
 import shutil
 
 import pytest
 
+from gsim3d.baselines import BASELINES
 from gsim3d.cli.main import main
 from gsim3d.data import find_scenes
 from gsim3d.evaluate.ablations import load_ablations
@@ -14,6 +16,7 @@ from gsim3d.io.files import read_yaml
 from gsim3d.io.settings import from_dict
 from gsim3d.reproduce import page, run
 from gsim3d.reproduce.cells import from_json, to_json
+from gsim3d.reproduce.entries import ENTRIES
 from gsim3d.reproduce.run import NO_TIME, Job, reproduce
 from gsim3d.train.config import TrainConfig
 from gsim3d.train.restore import restore
@@ -60,7 +63,7 @@ def first(work):
 def test_every_row_that_the_data_allow(first, work):
     content, lines, _ = first
     main_rows = [row for table, row in lines if table == MAIN]
-    assert main_rows == ["one", "constant", "copy", "constant velocity", "two"]
+    assert main_rows == ["one", "constant", "copy", "constant_velocity", "two"]
     assert {("Speed", "one"), ("Edits", "two"), ("History length at inference", "two, history 1")} <= lines.keys()
     assert lines[MAIN, "one"]["paper_other_data"] == "33.15 ± 3.51" and not lines[MAIN, "copy"]["paper_other_data"]
     assert lines[MAIN, "two"]["numbers"]["step_ms"] == lines["Speed", "two"]["numbers"]["step_ms"] > 0
@@ -137,6 +140,18 @@ def test_training(work, tmp_path, monkeypatch, no_curves):
     content, lines, said = made(work, tmp_path / "out", train=1, trajectories=1)
     assert ("Ablations", "latent: the base run") in lines and (MAIN, "trained here") in lines
     assert made(work, tmp_path / "out", train=1, trajectories=1)[2] == []
+
+
+def test_fitted_methods_are_rows(work, tmp_path, monkeypatch, no_curves):
+    few = {"anchors": 64, "neighbors": 8, "edge": 0.05, "substeps": 5, "static_iterations": 24}
+    few |= {"refine_iterations": 2, "velocity_iterations": 2, "dynamic_iterations": 2}
+    monkeypatch.setitem(BASELINES, "spring-gaus", dataclasses.replace(BASELINES["spring-gaus"], **few))
+    fitted = [dataclasses.replace(entry, device=None) for entry in ENTRIES[:2]]
+    monkeypatch.setattr(run, "ENTRIES", fitted)
+    _, lines, _ = made(work, tmp_path / "out", trajectories=1)
+    row = lines[MAIN, "spring-gaus"]
+    assert row["numbers"]["future.psnr_masked"] > 10 and row["seed"] is None
+    assert row["numbers"].keys() <= lines[MAIN, "copy"]["numbers"].keys()
 
 
 @pytest.mark.parametrize(
