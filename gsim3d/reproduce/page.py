@@ -222,6 +222,7 @@ def _figures(folder: Path, table: str, world: str, lines: Sequence[Line]) -> lis
         else:
             axes.plot(seconds, value, "o", color=f"C{k}", label=line.label)
     axes.set(xscale="log", xlabel="seconds a predicted step (fits: all of it)", ylabel="PSNR masked, dB", title=world)
+    axes.margins(x=0.2)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     save_figure(figure, file)
