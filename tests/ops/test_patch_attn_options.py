@@ -47,6 +47,17 @@ def test_32_bit_lists(device):
     assert torch.equal(ops.patch_attention(q, k, v, narrow), ops.patch_attention(q, k, v, wide))
 
 
+def test_vmap_leaves_out_rows_behind_the_last_offset():
+    q_rows, kv_rows, cu_q, cu_k = map(torch.tensor, LISTS)
+    table = ops.PatchTable(
+        torch.cat([q_rows, torch.tensor([3])]), torch.cat([kv_rows, torch.tensor([4, 4])]), cu_q, cu_k
+    )
+    q, k, v = (torch.stack([heads(n, 2, seed), heads(n, 2, seed + 9)]) for seed, n in enumerate((6, 5, 5)))
+    found = torch.func.vmap(lambda *one: ops.patch_attention(*one, table))(q, k, v)
+    assert torch.equal(found, torch.stack([attend(*one) for one in zip(q, k, v)]))
+    assert not found[:, 3].any()
+
+
 @pytest.mark.parametrize("scale", [0.7, -0.7])
 def test_log_sum_exp(scale):
     q, k, v = heads(6, 2), heads(5, 2, 1), heads(5, 2, 2)

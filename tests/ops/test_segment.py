@@ -80,7 +80,10 @@ def test_errors(op):
             OPS[op](rows(), torch.tensor(cu))
     with pytest.raises(ValueError, match=f"{op}: cu_rows must be int64"):
         OPS[op](rows(), CU.int())
-    with pytest.raises(ValueError, match=f"{op}: x must be"):
-        OPS[op](rows()[0], CU)
+    with pytest.raises(ValueError, match=f"{op}: cu_rows must be int64"):
+        OPS[op](rows(), CU[:0])
+    for x in (rows()[0], rows().long()):
+        with pytest.raises(ValueError, match=f"{op}: x must be"):
+            OPS[op](x, CU)
     with pytest.raises(NumericalError, match=f"{op}: x must be finite"):
         OPS[op](rows().fill_(torch.nan), CU)
