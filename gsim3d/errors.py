@@ -59,6 +59,10 @@ class FitWarning(UserWarning):
     """Data was changed to fit a model or a file format; the message says what was changed, and how to avoid it."""
 
 
+class UnfamiliarInput(FitWarning):
+    """The input is unlike the scenes that a model was validated on; the message has each measure and its range."""
+
+
 class GradientError(NotImplementedError):
     """An unsupported derivative of an op; the message names op, argument and order.
 

@@ -66,6 +66,7 @@ class Simulator(nn.Module):
         effects: effects that the model was trained to simulate, the default of :meth:`plan`.
         inputs: input specification of the training; None if unknown.
         setting: speed setting of :meth:`predict`.
+        trust: calibration of its errors (:class:`gsim3d.numerics.trust.Trust`); None: none was made.
         report: default StabilityReport of all methods.
         absent: names of parameters missing in the loaded weights; plans that use them raise an error.
         draws_in_graphs: whether rendering can be captured in a CUDA graph.
@@ -80,7 +81,7 @@ class Simulator(nn.Module):
         self.encoder = Encoder(config.encoder)
         self.dynamics = Dynamics(config.dynamics)
         self.renderer = GaussianHead(config.renderer)
-        self.effects, self.inputs, self.setting = EffectsSpec(), None, Setting()
+        self.effects, self.inputs, self.setting, self.trust = EffectsSpec(), None, Setting(), None
         self.report = StabilityReport()
         self.absent: frozenset[str] = frozenset()
 

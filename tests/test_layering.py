@@ -31,6 +31,7 @@ RINGS = {
         presets
         effects.plan
         cuda_graphs
+        numerics.trust
         numerics.speed
         pretrained.loading
         simulator

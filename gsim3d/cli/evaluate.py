@@ -45,6 +45,8 @@ examples:
   gsim3d evaluate --predictions runs/video_model runs/data --given 4
   gsim3d evaluate elastic-small data/elastic --baselines spring-gaus spring-gaus-all --device cuda
   gsim3d evaluate runs/a/metrics.json --against runs/b/metrics.json
+  gsim3d evaluate runs/model data/validation --scenes all --calibrate-trust
+  gsim3d evaluate runs/model data/test --scenes all --trust
   torchrun --nproc-per-node 4 -m gsim3d evaluate runs/model runs/data --device cuda
 """
 
@@ -94,6 +96,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--context", help="input cameras (default: evenly spaced)", **cameras)
     add("--metrics", nargs="+", metavar="METRIC", help="metrics (default: all whose weights are installed)")
     add("--clips", type=whole(2), default=48, metavar="N", help="largest number of clips for FVD (default: 48)")
+    add(
+        "--trust",
+        action="store_true",
+        help="also report how well the bounds of errors hold, on generated scenes (predicts 3 variants of each scene)",
+    )
+    add(
+        "--calibrate-trust",
+        action="store_true",
+        help="instead of scoring, calibrate bounds of errors and ranges of inputs on these scenes, which must be "
+        "generated and not of the training; written beside the checkpoint",
+    )
     add_fitting(parser)
     add("--against", metavar="FILE", help="compare with this report (metrics.json) of another model on the same scenes")
     add("--device", choices=("cpu", "cuda"), default="cpu", help="where to predict (default: cpu)")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from gsim3d.cli.arguments import add_fitting, whole
+from gsim3d.cli.arguments import add_fitting, number, whole
 from gsim3d.io.terminal import progress
 from gsim3d.pretrained import CHECKPOINT_HELP
 
@@ -26,6 +26,9 @@ edits.yaml, a list (docs/reference/effects.md has all operations):
 """
 
 
+BOUND_HELP = "print from which step on the bound of the error exceeds this, and show the bound in rollout.mp4"
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Predicts the future of one scene and writes it as video and as 3D Gaussians."
     parser.epilog = EPILOG
@@ -39,6 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--context", help="input cameras (default: spread evenly)", **cameras)
     add_fitting(parser)
     add("--html", action="store_true", help="also write player.html, which plays in any browser")
+    add("--max-error", type=number(0, above=True), metavar="METRES", help=BOUND_HELP)
     add("--edit", metavar="FILE", help="YAML file of changes of the scene on the way")
     add("--effects", metavar="FILE", help="YAML file of what to compute (default: as in training)")
     tuned = "exact (default), or balanced or fast: tuned by gsim3d profile to keep 99.9 %% or 99 %% of the gain"
@@ -55,6 +59,7 @@ def run(args: argparse.Namespace) -> int:
     from gsim3d.evaluate.pictures import write_prediction
     from gsim3d.evaluate.protocol import check_cameras, default_views, encode_folder, predict
     from gsim3d.io.files import new_output_path
+    from gsim3d.numerics.trust import trust_of
     from gsim3d.train.restore import restore
 
     out = new_output_path(args.out)
@@ -74,9 +79,13 @@ def run(args: argparse.Namespace) -> int:
         spec = replace(spec, structure=structure_of(edits))
     restored = replace(restored, plan=simulator.plan(replace(spec, outputs=OutputEffects())))
     first = args.start + n_trained - restored.n_encoded
+    trust = None if args.max_error is None else trust_of(simulator, args.checkpoint)
     with progress(None, "simulating", n_future, unit="step", quiet=args.quiet) as bar:
-        prediction = predict(restored, scene, context, n_future, first, edits, bar.update)
-    write_prediction(out, restored, scene, prediction, cams, first, player=args.html, quiet=args.quiet)
+        prediction = predict(restored, scene, context, n_future, first, edits, bar.update, trust is not None)
+    bounds = None if trust is None else trust.bound(prediction.spread)
+    write_prediction(out, restored, scene, prediction, cams, first, player=args.html, quiet=args.quiet, bounds=bounds)
     rested = f" ({prediction.resting:.0%} of the particles at rest, not computed)" if prediction.resting else ""
     print(f"{prediction.n_encoded} steps encoded, {n_future} predicted{rested}; written: {out}")
+    if trust is not None:
+        print(trust.verdict(bounds, prediction.step(prediction.n_encoded), args.max_error))
     return 0

@@ -9,13 +9,14 @@ from pathlib import Path
 from gsim3d.baselines import baseline
 from gsim3d.data import Scene, find_scenes, published_split, split_scenes
 from gsim3d.errors import InputError
-from gsim3d.evaluate import compare
+from gsim3d.evaluate import compare, trust
 from gsim3d.evaluate.pictures import write_curves
 from gsim3d.evaluate.predictions import Predictions
 from gsim3d.evaluate.protocol import check_cameras, default_views, horizon, score_scenes
 from gsim3d.evaluate.report import markdown, summarize, table, write_csv, write_json
 from gsim3d.evaluate.scoring import SceneScores, measurable
 from gsim3d.io.files import output_path, with_parents, write_whole
+from gsim3d.numerics.trust import trust_of
 from gsim3d.pretrained import FOLDER, folder_of
 from gsim3d.synth.held_out import set_of
 from gsim3d.train.processes import Processes, joined
@@ -41,6 +42,8 @@ class Job:
         context: input cameras; None spaces them evenly.
         metrics: metrics to measure; None measures all whose weights are installed.
         clips: largest number of clips for FVD.
+        trust: also report how well the calibrated bounds of errors hold.
+        calibrate_trust: calibrate the bounds and write them beside the checkpoint, instead of scoring.
         keep, resample: see :meth:`gsim3d.train.restore.Restored.open_scene`.
         against: report of another model to compare with.
         device: "cpu" or "cuda".
@@ -59,6 +62,8 @@ class Job:
     context: Sequence[int] | None = None
     metrics: Sequence[str] | None = None
     clips: int = 48
+    trust: bool = False
+    calibrate_trust: bool = False
     keep: Sequence[str] = ()
     resample: bool = False
     against: str | None = None
@@ -84,8 +89,8 @@ def evaluate(job: Job) -> None:
         raise InputError("--given: the number of input steps (at least 1) is required without a CHECKPOINT")
     if job.checkpoint is not None and job.given is not None:
         raise InputError("--given: cannot be combined with a CHECKPOINT, whose history sets the input steps")
-    if job.checkpoint is None and (job.resample or job.keep):
-        raise InputError("--resample and --keep require a CHECKPOINT")
+    if job.checkpoint is None and (job.resample or job.keep or job.trust or job.calibrate_trust):
+        raise InputError("--resample, --keep, --trust and --calibrate-trust require a CHECKPOINT")
     with joined(job.device) as processes:
         _evaluate(job, metrics, not_measured, other, processes)
 
@@ -93,6 +98,8 @@ def evaluate(job: Job) -> None:
 def _evaluate(job: Job, metrics: tuple, not_measured: dict, against: dict | None, processes: Processes) -> None:
     """Scores this process's share of the scenes; the first process writes the report."""
     restored = None if job.checkpoint is None else restore(job.checkpoint, job.device)
+    if job.trust:
+        trust_of(restored.simulator, job.checkpoint)
     fitted = [baseline(name, job.device) for name in job.baselines]
     others = [*(Predictions.open(given, job.data) for given in job.predictions), *fitted]
     if len({other.name for other in others}) != len(others):
@@ -101,6 +108,11 @@ def _evaluate(job: Job, metrics: tuple, not_measured: dict, against: dict | None
     n_encoded = job.given if restored is None else restored.data.history
     scenes, conditions = _open_scenes(job, restored)
     views, n_future = _views(job, restored, others, scenes, n_encoded)
+    if job.calibrate_trust:
+        if processes.is_first:
+            made = trust.calibrate(restored, scenes, n_future)
+            print(f"written: {trust.save_trust(folder_of(job.checkpoint), restored.checkpoint.digest, made)}")
+        return
     not_applicable = {}
     for scene, (_, targets) in zip(scenes, views):
         for other in others:
@@ -135,6 +147,9 @@ def _evaluate(job: Job, metrics: tuple, not_measured: dict, against: dict | None
     scores = [replace(score, scene=name) for score, name in zip(scores, names, strict=True)]
     summary = {**conditions, **summarize(scores, not_measured)}
     print("\n".join([table(summary), *not_applicable.values()]))
+    if job.trust:
+        summary["trust"] = trust.report(restored.simulator.trust, trust.collect(restored, scenes, n_future))
+        print(f"\n{trust.table(summary['trust'])}")
     refused = None
     if against is not None:
         try:

@@ -108,9 +108,18 @@ def measure_particles(
     points = torch.stack([cloud.means[moving] for cloud in clouds]).cpu()
     bodies = torch.zeros(points.shape[1], dtype=torch.int64)
     if truth is not None:
-        nearest = [torch.cdist(points[0].double(), nodes.double()).amin(1) for nodes in truth]
-        bodies = torch.stack(nearest).argmin(0)
+        bodies = nearest_body(points[0], truth)
     return measure(points, bodies, scene.fps, torch.from_numpy(scene.bounds))
+
+
+def nearest_body(points: Tensor, truth: Sequence[Tensor]) -> Tensor:
+    """Returns the body int64 [N] that each of ``points`` [N, 3] is on.
+
+    Args:
+        truth: nodes [M, 3] of each body; of the 4 axes of a rigid one, the first is its origin.
+    """
+    nodes = [own[:1] if len(own) == 4 else own for own in truth]
+    return torch.stack([torch.cdist(points.double(), own.double()).amin(1) for own in nodes]).argmin(0)
 
 
 def measure_truth(states: Sequence[Tensor], scene: Scene, steps: range) -> dict[str, Tensor]:

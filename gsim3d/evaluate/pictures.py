@@ -25,8 +25,9 @@ from gsim3d.io.particles import STATE, write_particles
 from gsim3d.io.sequence import write_about
 from gsim3d.io.terminal import progress
 from gsim3d.nn.gaussian_head import render
+from gsim3d.numerics.trust import draw_values
 from gsim3d.train.restore import Restored
-from gsim3d.viewer.films import film_frames
+from gsim3d.viewer.films import film_frames, turbo
 from gsim3d.viewer.player import View, write_player
 
 SPLAT_SIZE = 320  # pixels, height of the picture of the Gaussians
@@ -77,6 +78,7 @@ def write_prediction(
     *,
     player: bool = False,
     quiet: bool = True,
+    bounds: Tensor | None = None,
 ) -> None:
     """Writes a prediction as images, video, Gaussians and state into ``folder``, which is moved into place at the end.
 
@@ -85,6 +87,7 @@ def write_prediction(
         first: step of the scene at which the prediction starts.
         player: also write player.html.
         quiet: hide the progress bar.
+        bounds: [S, N] metres, bounds of the errors of the predicted particles, a further row of the video.
     """
     folder = Path(folder)
     steps = [prediction.particles.select_clouds([step]) for step in range(prediction.n_steps)]
@@ -99,6 +102,8 @@ def write_prediction(
             for cam, image in zip(cams, views, strict=True):
                 write_picture(part / "frames" / f"cam_{cam}_{step:04d}.png", image)
         rows = {"truth": truth, "predicted": np.stack(images)}
+        if bounds is not None:
+            rows = bound_images(restored, scene, prediction, cams, first, bounds) | rows
         write_video(part / "rollout.mp4", film_frames(rows, scene.fps, prediction.n_encoded), scene.fps)
         write_gaussians(part / "gaussians", restored, prediction, scene.fps)
         last = last_steps(prediction.particles, 2**restored.simulator.config.dynamics.history_bits)
@@ -117,6 +122,23 @@ def write_prediction(
         os.replace(part, folder)
     finally:
         shutil.rmtree(part, ignore_errors=True)
+
+
+def bound_images(
+    restored: Restored, scene: Scene, prediction: Prediction, cams: Sequence[int], first: int, bounds: Tensor
+) -> dict[str, np.ndarray]:
+    """Renders the bounds of errors [S, N] as colours: a row of a video, whose label names the bound of the last colour.
+
+    Given steps are black, as pixels without particles.
+    """
+    largest, n_steps = max(float(bounds.max()), 1e-9), prediction.n_steps
+    images = np.zeros((n_steps, len(cams), scene.height, scene.width, 3), np.uint8)
+    for step, values in enumerate(bounds, prediction.n_encoded):
+        cameras = scene.cameras_at(cams, [first + step]).to(values.device)
+        drawn = draw_values(restored.simulator, prediction.step(step), values / largest, cameras)
+        shown = drawn.cpu().numpy()
+        images[step] = np.where(shown[..., None] > 0, turbo(shown), 0)
+    return {f"bound, red {largest:.2g} m": images}
 
 
 @torch.no_grad()

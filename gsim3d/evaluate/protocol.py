@@ -35,7 +35,8 @@ from gsim3d.evaluate.physics import measure_particles, measure_truth, true_state
 from gsim3d.evaluate.predictions import Predictions
 from gsim3d.evaluate.scoring import EXACT_PARTS, PLAIN_METRICS, SceneScores, SceneTruth
 from gsim3d.io.terminal import progress
-from gsim3d.numerics.speed import draw, encode
+from gsim3d.numerics.speed import draw, encode_histories
+from gsim3d.numerics.trust import MOST_LEFT_OUT, VARIANTS, rollout_with_spread
 from gsim3d.state import DYNAMIC, Particles
 from gsim3d.train.processes import Processes
 from gsim3d.train.restore import Restored
@@ -56,12 +57,14 @@ class Prediction:
         n_encoded: number of encoded steps.
         context_cams: input cameras.
         resting: fraction of the predicted particles that were at rest and skipped.
+        spread: [S - n_encoded, N] metres, see :func:`gsim3d.numerics.trust.rollout_with_spread`; None: not computed.
     """
 
     particles: Particles
     n_encoded: int
     context_cams: tuple[int, ...]
     resting: float = 0.0
+    spread: Tensor | None = None
 
     @property
     def n_steps(self) -> int:
@@ -131,9 +134,10 @@ def predict(
     start: int = 0,
     edits: Sequence[Edit] = (),
     on_steps: Callable[[int], object] | None = None,
+    with_spread: bool = False,
 ) -> Prediction:
     """Predicts one scene, see :func:`predict_together`."""
-    options = {"start": start, "edits": edits, "on_steps": on_steps}
+    options = {"start": start, "edits": edits, "on_steps": on_steps, "with_spread": with_spread}
     return predict_together(restored, [scene], n_future, [context_cams], **options)[0]
 
 
@@ -158,6 +162,7 @@ def predict_together(
     start: int = 0,
     edits: Sequence[Edit] = (),
     on_steps: Callable[[int], object] | None = None,
+    with_spread: bool = False,
 ) -> list[Prediction]:
     """Encodes the input steps of scenes from ``start`` and predicts them in one rollout, also past their last frame.
 
@@ -169,24 +174,34 @@ def predict_together(
         start: first input step.
         edits: edits to apply during the rollout.
         on_steps: called with the number of steps just simulated.
+        with_spread: also predict variants, whose spread the predictions then have; takes no edits.
 
     Raises:
         InputError: the image size differs from training, a camera or step does not exist, or an edit is invalid.
     """
     _check_count(n_future)
+    if with_spread and edits:
+        raise InputError("edits: the spread of variants is not defined for scenes with edits")
+    n_together = len(scenes) * (len(VARIANTS) if with_spread else 1)
 
     def counted(predict: Callable) -> Callable:
         def wrapped(*state, **options):
             steps = predict(*state, **options)
-            on_steps(steps.n_clouds)
+            on_steps(steps.n_clouds // n_together)
             return steps
 
         return wrapped
 
     contexts = [default_views(restored, scene)[0] for scene in scenes] if contexts is None else contexts
-    encoded, log = _encode(restored, scenes, contexts, start), RestLog()
-    options = {"edits": edits, "log": log, "wrap": on_steps and counted}
-    steps = restored.simulator.predict(encoded, n_future, restored.plan, **options).steps
+    simulator, log, spreads = restored.simulator, RestLog(), [None] * len(scenes)
+    options = {"log": log, "wrap": on_steps and counted}
+    if with_spread:
+        histories = _encode(restored, scenes, contexts, start, MOST_LEFT_OUT)
+        steps, spread = rollout_with_spread(simulator, histories, n_future, restored.plan, **options)
+        encoded, spreads = histories[0], spread.split(steps[0].clouds.counts, 1)
+    else:
+        encoded = _encode(restored, scenes, contexts, start)[0]
+        steps = simulator.predict(encoded, n_future, restored.plan, edits=edits, **options).steps
     together, n_encoded = concatenate([encoded, *steps]), restored.n_encoded
     n_steps = n_encoded + n_future
     return [
@@ -195,21 +210,23 @@ def predict_together(
             n_encoded,
             tuple(context),
             log.resting_share,
+            spread,
         )
-        for b, context in enumerate(contexts)
+        for b, (context, spread) in enumerate(zip(contexts, spreads, strict=True))
     ]
 
 
 def encode_steps(restored: Restored, scene: Scene, context_cams: Sequence[int], start: int = 0) -> Particles:
     """Encodes the input steps of a scene from ``start``."""
-    return _encode(restored, [scene], [context_cams], start)
+    return _encode(restored, [scene], [context_cams], start)[0]
 
 
 @torch.no_grad()
 def _encode(
-    restored: Restored, scenes: Sequence[Scene], contexts: Sequence[Sequence[int]], start: int = 0
-) -> Particles:
-    return encode(restored.simulator, input_frames(restored, scenes, contexts, start))
+    restored: Restored, scenes: Sequence[Scene], contexts: Sequence[Sequence[int]], start: int = 0, left_out: int = 0
+) -> list[Particles]:
+    frames, names = input_frames(restored, scenes, contexts, start), [str(scene.path) for scene in scenes]
+    return encode_histories(restored.simulator, frames, names, left_out)
 
 
 def input_frames(

@@ -20,6 +20,7 @@ from gsim3d.errors import InputError, check_ranges, did_you_mean
 from gsim3d.io.files import MAX_TEXT, read_file, shown
 from gsim3d.io.plain import parse_json
 from gsim3d.io.settings import from_dict
+from gsim3d.numerics.trust import MOST_LEFT_OUT, check_input, without_oldest
 from gsim3d.ops.raster import CUTOFFS, Rendering
 from gsim3d.presets import ModelConfig
 from gsim3d.state import DYNAMIC, Particles
@@ -160,8 +161,25 @@ class Setting:
         return particles.select_rows(kept)
 
 
-def encode(simulator: Any, source: Frames | FrameSource) -> Particles:
-    """Encodes frames to the initial state of :func:`predict`. Raises InputError for a wrong image size."""
+def encode(simulator: Any, source: Frames | FrameSource, names: Sequence[str] = ()) -> Particles:
+    """Encodes frames to the initial state of :func:`predict`; see :func:`encode_histories`."""
+    return encode_histories(simulator, source, names, 0)[0]
+
+
+def encode_histories(
+    simulator: Any, source: Frames | FrameSource, names: Sequence[str] = (), left_out: int = MOST_LEFT_OUT
+) -> list[Particles]:
+    """Encodes frames, also without their 1 to ``left_out`` oldest steps, and warns as :func:`check_input` does.
+
+    Args:
+        simulator: a :class:`gsim3d.Simulator`.
+        source: see :meth:`gsim3d.Simulator.predict`.
+        names: names of the scenes in warnings.
+        left_out: largest number of steps to leave out.
+
+    Raises:
+        InputError: the image size is wrong.
+    """
     inputs = InputSpec() if simulator.inputs is None else simulator.inputs
     frames = source if isinstance(source, Frames) else source.input_frames(inputs)
     size = (frames.cameras.width, frames.cameras.height)
@@ -169,9 +187,13 @@ def encode(simulator: Any, source: Frames | FrameSource) -> Particles:
         wanted = "x".join(map(str, inputs.image_size))
         raise InputError(f"predict: images must be {wanted} pixels, as in training; got {size[0]}x{size[1]}")
     setting, device = simulator.setting, next(simulator.parameters()).device
-    frames = frames.subsample(inputs.background_stride, inputs.body_stride).to(device)
+    frames, states = frames.to(device), []
     with setting.precision("encoder", device.type):
-        return setting.retained(simulator.encode(frames))
+        for n_steps in range(left_out + 1):
+            some = without_oldest(frames, n_steps).subsample(inputs.background_stride, inputs.body_stride)
+            states.append(setting.retained(simulator.encode(some)))
+    check_input(simulator, frames, states[0], names)
+    return states
 
 
 def predict(

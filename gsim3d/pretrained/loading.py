@@ -25,6 +25,7 @@ from gsim3d.io import checkpoint
 from gsim3d.io.files import shown
 from gsim3d.io.settings import from_dict, to_dict
 from gsim3d.numerics.speed import load_speed
+from gsim3d.numerics.trust import load_trust
 from gsim3d.ops import cuda_compiled
 from gsim3d.presets import ModelConfig
 
@@ -78,6 +79,8 @@ def load(
     asymmetric = simulator.config.dynamics.is_asymmetric
     simulator.effects, simulator.setting = setting.of_effects(found.effects, asymmetric), setting
     simulator.inputs = setting.of_inputs(found.inputs)
+    if speed == "exact":  # other speeds change the measures of the input
+        simulator.trust = load_trust(pretrained.folder_of(name_or_path), saved.digest)
     return simulator.eval().to(device), saved
 
 

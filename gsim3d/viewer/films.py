@@ -39,6 +39,12 @@ def film_frames(rows: Mapping[str, np.ndarray], fps: float, n_given: int = 0) ->
         yield canvas
 
 
+def turbo(values: np.ndarray) -> np.ndarray:
+    """Returns colours uint8 [..., 3] of ``values`` in [0, 1], from blue to red."""
+    table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1]
+    return table[(np.clip(values, 0, 1) * 255).round().astype(np.uint8)]
+
+
 def write_time(image: np.ndarray, step: int, fps: float) -> None:
     """Writes the time of ``step`` into the upper right corner of ``image``."""
     write_text(image, f"{step / fps:.2f} s", WHITE, right=True)

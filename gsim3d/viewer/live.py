@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -21,8 +20,9 @@ from gsim3d.io.orbit import picture
 from gsim3d.math.rotations import rotation_matrices, rotation_to_quat
 from gsim3d.state import ASLEEP, DYNAMIC, FROZEN, Gaussians, Particles
 from gsim3d.viewer.export import write_frames
+from gsim3d.viewer.films import turbo
 
-COLORINGS = ("appearance", "velocity", "activity", "latents")
+COLORINGS = ("appearance", "velocity", "activity", "latents", "trust")
 AWAKE_COLOR, FROZEN_COLOR, ASLEEP_COLOR = (0.95, 0.5, 0.1), (0.55, 0.55, 0.55), (0.2, 0.45, 0.95)
 FASTEST = 0.99  # quantile of the speeds that has the last colour
 LATENT_RANGE = 0.02  # quantile of the latents that is black; as many are at full brightness
@@ -168,14 +168,16 @@ class Target:
         scene: Scene | None = None,
         first: int = 0,
         n_encoded: int = 0,
+        bounds: Callable[[int], Tensor] | None = None,
     ):
         """
         Args:
             frames: Gaussians of each; empty: they are drawn from ``particles``, or there are none.
             draw: Gaussians of particles.
+            bounds: bounds of the errors of a frame's particles, [N] metres; 0 where they do not move.
         """
         self.name, self.fps, self.scene, self.first, self.n_encoded = name, fps, scene, first, n_encoded
-        self._draw = draw
+        self._draw, self._bounds = draw, bounds
         self.replace(particles, frames)
 
     def replace(self, particles: Sequence[Particles], frames: Frames = ()) -> None:
@@ -203,7 +205,7 @@ class Target:
     def colorings(self) -> tuple[str, ...]:
         """Those of COLORINGS that the target has values for."""
         known = {"appearance": True, "velocity": self.n_frames > 1 and self.gaussians(0) is not None}
-        known |= {"activity": bool(self.particles), "latents": self._has_latents()}
+        known |= {"activity": bool(self.particles), "latents": self._has_latents(), "trust": self._bounds is not None}
         return tuple(name for name in COLORINGS if known[name])
 
     def _has_latents(self) -> bool:
@@ -225,6 +227,8 @@ class Target:
         """
         if coloring not in self.colorings[1:]:
             raise InputError(f"{self.name} has no colours by {coloring}; it has {', '.join(self.colorings)}")
+        if coloring == "trust":
+            return self._colors_of_trust(frame)
         if coloring == "velocity":
             return self._colors_of_velocity(frame)
         return self._colors_of_activity(frame) if coloring == "activity" else self._colors_of_latents(frame)
@@ -236,8 +240,13 @@ class Target:
             moving = np.concatenate([speed[speed > 0] for speed in speeds])
             self._fastest = float(np.quantile(moving, FASTEST)) if len(moving) else 1.0
         speed = (self.displacements(frame).norm(dim=1) / self._fastest).clamp(0, 1)
-        table = cv2.applyColorMap((speed.numpy() * 255).round().astype(np.uint8)[:, None], cv2.COLORMAP_TURBO)
-        return torch.from_numpy(table[:, 0, ::-1].astype(np.float32) / 255)
+        return torch.from_numpy(turbo(speed.numpy()).astype(np.float32) / 255)
+
+    def _colors_of_trust(self, frame: int) -> Tensor:
+        largest = self._bounds(self.n_frames - 1).quantile(FASTEST).clamp(min=1e-9)
+        colors = torch.from_numpy(turbo((self._bounds(frame) / largest).numpy()).astype(np.float32) / 255)
+        colors[self.particles[frame].activity.cpu() == FROZEN] = torch.tensor(FROZEN_COLOR)
+        return colors
 
     def _colors_of_activity(self, frame: int) -> Tensor:
         activity = self.particles[frame].activity.cpu()

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gsim3d.cameras import Frames
 from gsim3d.data import Scene
 from gsim3d.dynamics import concatenate, last_steps
 from gsim3d.effects.edits import Duplicate, Edit, Move, Operation, Recolor, Remove, Throw, structure_of
@@ -17,9 +18,11 @@ from gsim3d.effects.plan import Plan
 from gsim3d.effects.selection import Selection
 from gsim3d.effects.spec import BACKGROUNDS, CHANGING, POLICIES, EffectsSpec, OutputEffects, Sleep, UnsupportedEffect
 from gsim3d.errors import InputError
+from gsim3d.numerics.speed import encode, encode_histories
+from gsim3d.numerics.trust import rollout_with_spread
 from gsim3d.priors.movable import Movable
 from gsim3d.priors.segmentation import SegmentationConfig, segment_bodies
-from gsim3d.state import FROZEN, Gaussians, Particles
+from gsim3d.state import DYNAMIC, FROZEN, Gaussians, Particles
 from gsim3d.train.restore import Restored
 from gsim3d.viewer.live import Target
 
@@ -42,12 +45,14 @@ class Part:
         edits: made right before it.
         history: steps before it as the model saw them, after the edits.
         steps: predicted particles.
+        plan: by which they were predicted.
     """
 
     first: int
     edits: tuple[Edit, ...]
     history: Particles
     steps: list[Particles]
+    plan: Plan
 
 
 @dataclass(frozen=True)
@@ -87,6 +92,8 @@ class Simulation:
             InputError: the scene has too few steps or cameras.
         """
         self._simulator, self._parts, self.seconds_a_step = restored.simulator, [], 0.0
+        self._frames: Frames | None = None
+        self._spreads: dict[int, Tensor] = {}  # first step of a part -> spread of its particles
         spec, plan = restored.plan.spec, restored.plan
         self.effects = dataclasses.replace(
             spec,
@@ -102,11 +109,9 @@ class Simulation:
         if isinstance(source, Scene):
             inputs = restored.simulator.inputs
             assert inputs is not None  # of what was trained
-            frames = source.input_frames(inputs, start=start)
+            self._frames = source.input_frames(inputs, start=start)
             with torch.no_grad():
-                state = restored.simulator.encode(
-                    frames.subsample(inputs.background_stride, inputs.body_stride).to(restored.device)
-                )
+                state = encode(restored.simulator, self._frames, (str(source.path),))
             about = {"name": source.name, "fps": source.fps, "scene": source, "first": start}
             n_steps = n_steps or max(1, source.n_steps - start - state.n_clouds)
         else:
@@ -115,7 +120,8 @@ class Simulation:
         offset = state.world_offset
         self._offset = [0.0, 0.0, 0.0] if offset is None else offset[0].tolist()
         given = [state.select_clouds([cloud]) for cloud in range(state.n_clouds)]
-        self.target = Target(draw=self._draw, particles=given, n_encoded=len(given), **about)
+        bounds = None if self._simulator.trust is None else self._bounds
+        self.target = Target(draw=self._draw, particles=given, n_encoded=len(given), bounds=bounds, **about)
         self.simulate_on(len(given) - 1, n_steps or 12)
 
     @property
@@ -125,6 +131,22 @@ class Simulation:
 
     def _draw(self, particles: Particles) -> Gaussians:
         return self._simulator.renderer(particles, sh_degree=self._sh_degree)
+
+    def _bounds(self, frame: int) -> Tensor:
+        """Bounds of the errors of a frame's particles, [N] metres on the CPU; predicts variants of a part once."""
+        step, particles = frame - self.target.n_encoded, self.target.particles[frame]
+        part = next((part for part in reversed(self._parts) if part.first <= step), None)
+        if part is None:
+            return torch.zeros(particles.n_rows)
+        if part.first not in self._spreads:
+            histories = [part.history]
+            if part.first == 0 and not part.edits and self._frames is not None:
+                with torch.no_grad():
+                    histories = encode_histories(self._simulator, self._frames)
+            made = rollout_with_spread(self._simulator, histories, len(part.steps), part.plan)
+            self._spreads[part.first] = made[1].cpu()
+        bounds = self._simulator.trust.bound(self._spreads[part.first], first=part.first + 1)[step - part.first]
+        return torch.where(particles.activity.cpu() == DYNAMIC, bounds, 0).float()
 
     def _step_after(self, frame: int) -> int:
         step, n_given = frame + 1 - self.target.n_encoded, self.target.n_encoded
@@ -173,7 +195,8 @@ class Simulation:
             history = edit.apply(history, self._simulator._colors)
         history = self._simulator.dynamics.initialize(history) if edits else history
         steps, self.seconds_a_step = self._timed(history, n_steps, plan)
-        self._parts = [part for part in self._parts if part.first < step] + [Part(step, edits, history, steps)]
+        self._parts = [part for part in self._parts if part.first < step] + [Part(step, edits, history, steps, plan)]
+        self._spreads = {first: spread for first, spread in self._spreads.items() if first < step}
         self._sh_degree = plan.sh_degree
         self.target.replace([*self.target.particles[: frame + 1], *steps])
         return self.seconds_a_step

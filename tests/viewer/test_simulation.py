@@ -14,10 +14,11 @@ from gsim3d.errors import FitWarning, InputError
 from gsim3d.io import read_particles, write_particles
 from gsim3d.io.particles import STATE
 from gsim3d.math.spherical_harmonics import SH_0
+from gsim3d.numerics.trust import Trust
 from gsim3d.state import FROZEN, concatenate
 from gsim3d.train.restore import restore
 from gsim3d.viewer import server
-from gsim3d.viewer.live import Layers
+from gsim3d.viewer.live import FROZEN_COLOR, Layers
 from gsim3d.viewer.simulation import Simulation, hit
 from gsim3d.viewer.targets import open_state, open_target
 from tests.effects.models import EXPLICIT_CONFIG
@@ -63,6 +64,20 @@ def test_simulate_on_removes_inside_of_a_box_and_refuses_without_a_change(simula
     simulation.simulate_on(3, 1, [simulation.operation("remove", "all", (0, 0, 0), box)])
     assert isinstance(simulation.edits[0].operation, Remove)
     assert 0 < target.particles[-1].n_rows < target.particles[3].n_rows
+
+
+def test_trust_colours_particles_by_the_bound_of_their_error(checkpoint, scene):
+    restored = restore(checkpoint)
+    restored.simulator.trust = Trust(2, 3, 0.5, 1.0, (-9.0, 0.0), (0.9,), ((0.01, 0.1),), {}, 3.0)
+    simulation = Simulation(restored, restored.open_scene(scene), 3)
+    target = simulation.target
+    assert target.colorings[-1] == "trust"
+    simulation.simulate_on(3, 2, [Move("all", (0.0, 0.0, 0.1))])
+    bounds = [simulation._bounds(frame) for frame in range(target.n_frames)]
+    assert not bounds[0].any() and not bounds[1].any() and 0 < bounds[2].max() < bounds[3].max() < bounds[5].max()
+    colors, frozen = target.colors(5, "trust"), target.particles[5].activity == FROZEN
+    assert colors.shape == (len(frozen), 3) and bool((colors[frozen] == torch.tensor(FROZEN_COLOR)).all())
+    assert len(colors[~frozen].unique(dim=0)) > 1
 
 
 def test_bodies_are_found_and_boxes_hold_them_in_the_history(simulation):
