@@ -395,7 +395,7 @@ class CapturedRollout:
                 f"CapturedRollout: state must have the rows and scenes of the first one{where}, clouds that start at "
                 f"rows {[*own.starts]} of scenes {[*own.scenes]}; got {[*table.starts]} of {[*table.scenes]}"
             )
-        if _gaps(table) != _gaps(own):
+        if gaps_of(table) != gaps_of(own):
             raise InputError(
                 f"CapturedRollout: state must have the same differences between steps as the first one, "
                 f"{list(own.steps)}; got {list(table.steps)}"
@@ -497,7 +497,7 @@ def _clones(fields: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name: value.detach().clone() for name, value in fields.items()}
 
 
-def _gaps(table: CloudTable) -> list[int | None]:
+def gaps_of(table: CloudTable) -> list[int | None]:
     """Returns the difference of steps between consecutive clouds; None between scenes."""
     keys = list(zip(table.scenes, table.steps))
     return [b[1] - a[1] if a[0] == b[0] else None for a, b in zip(keys, keys[1:])]

@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -49,6 +49,7 @@ from gsim3d.nn.gaussian_head import GaussianHead, render
 from gsim3d.nn.multiview_encoder import Encoder, StaticShapes, pixel_rows
 from gsim3d.numerics.policy import OnInvalid, check_on_invalid
 from gsim3d.numerics.report import StabilityReport
+from gsim3d.numerics.rollout_graphs import RolloutGraphs
 from gsim3d.numerics.speed import Setting, predict
 from gsim3d.numerics.validate import check_particles, drop_particles, validate_frames, validate_particles
 from gsim3d.ops.curve import Pyramid
@@ -68,6 +69,7 @@ class Simulator(nn.Module):
         setting: speed setting of :meth:`predict`.
         trust: calibration of its errors (:class:`gsim3d.numerics.trust.Trust`); None: none was made.
         report: default StabilityReport of all methods.
+        graphs: graph of the last rollout with ``graph="auto"``, :class:`gsim3d.numerics.rollout_graphs.RolloutGraphs`.
         absent: names of parameters missing in the loaded weights; plans that use them raise an error.
         draws_in_graphs: whether rendering can be captured in a CUDA graph.
     """
@@ -82,7 +84,7 @@ class Simulator(nn.Module):
         self.dynamics = Dynamics(config.dynamics)
         self.renderer = GaussianHead(config.renderer)
         self.effects, self.inputs, self.setting, self.trust = EffectsSpec(), None, Setting(), None
-        self.report = StabilityReport()
+        self.report, self.graphs = StabilityReport(), RolloutGraphs()
         self.absent: frozenset[str] = frozenset()
 
     @classmethod
@@ -142,7 +144,7 @@ class Simulator(nn.Module):
             cameras: cameras to render at every step. Default: no rendering.
             background: [3] or [I, 3], background colour. Default: black.
             edits: edits to apply during the rollout.
-            wrap: see :meth:`rollout`; not called if the setting replays a CUDA graph.
+            wrap: see :meth:`rollout`.
             log: see :meth:`rollout`.
 
         Returns:
@@ -257,6 +259,7 @@ class Simulator(nn.Module):
         log: RestLog | None = None,
         edits: Iterable[Edit] = (),
         actors: Sequence[Actor] = (),
+        graph: Literal["auto"] | None = None,
     ) -> list[Particles]:
         """Predicts the next ``n_steps`` steps.
 
@@ -276,6 +279,9 @@ class Simulator(nn.Module):
             log: records which particles were at rest and skipped.
             edits: edits to apply during the rollout (:mod:`gsim3d.effects.edits`); they wake all particles.
             actors: kinematic particles that move as prescribed (:mod:`gsim3d.effects.actors`).
+            graph: "auto" replays the rollout from a CUDA graph when calls with the same shapes repeat, on a GPU and
+                without gradients; other calls run step by step, and ``self.graphs.obstacle`` says why. Default: step by
+                step.
 
         Returns:
             Particles of each step, with one cloud per scene.
@@ -296,10 +302,20 @@ class Simulator(nn.Module):
                 for one, clouds in by_plan(state, plans)
             ]
             return [concatenate(step) for step in zip(*parts, strict=True)]
+        if graph not in (None, "auto"):
+            raise InputError(f'rollout: graph must be "auto" or None; got {graph!r}')
         plan, guard = plan or self.plan(), self._guard("rollout", on_invalid, report)
+        self._check(state, "rollout")
+        if graph is not None:
+            others: dict[str, Any] = dict(
+                generator=generator, on_invalid=on_invalid, geometry=geometry, wrap=wrap, log=log
+            )
+            others |= dict(edits=(edits := tuple(edits)), actors=tuple(actors))
+            replayed = self.graphs.replayed(self, state, n_steps, plan, guard.keywords["report"], others)
+            if replayed is not None:
+                return replayed
         predict = partial(self._predict, plan=plan, generator=generator, guard=guard, geometry=geometry)
         predict = predict if wrap is None else wrap(predict)
-        self._check(state, "rollout")
         state, steps = self._prepare(state, plan), []
         if actors:
             acting = self._acting(actors, state, plan, n_steps)

@@ -31,7 +31,7 @@ RINGS = {
         presets
         effects.plan
         cuda_graphs
-        numerics.trust
+        numerics.trust numerics.rollout_graphs
         numerics.speed
         pretrained.loading
         simulator

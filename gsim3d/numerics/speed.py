@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from gsim3d.cameras import Cameras, Frames, FrameSource, InputSpec
-from gsim3d.cuda_graphs import CapturedRollout, Prediction
+from gsim3d.cuda_graphs import Prediction
 from gsim3d.effects.edits import Edit
 from gsim3d.effects.plan import Plan
 from gsim3d.effects.spec import EffectsSpec, Sleep
@@ -40,7 +40,7 @@ class Setting:
         encoder: precision, "fp32", "tf32", "bf16" or "fp16"; positions, codes, splats and sums are always float32.
         dynamics: precision of the dynamics.
         renderer: precision of the renderer.
-        captured: replays the rollout from a CUDA graph.
+        captured: rolls out with ``graph="auto"``, from a CUDA graph when calls repeat.
         context_views: input cameras; None: as in training.
         history: input steps; None: as in training.
         background: replaces ``EffectsSpec.dynamics.background``; None: as in training.
@@ -212,10 +212,8 @@ def predict(
     state = source if isinstance(source, Particles) else encode(simulator, source)
     setting, device = simulator.setting, state.means.device
     with setting.precision("dynamics", device.type):
-        if setting.captured and not edits and device.type == "cuda":
-            states = CapturedRollout(simulator, state, steps, plan)(state).steps
-        else:
-            states = simulator.rollout(state, steps, plan, edits=edits, **options)
+        graph = "auto" if setting.captured else None
+        states = simulator.rollout(state, steps, plan, edits=edits, graph=graph, **options)
     images = []
     if cameras is not None:
         images = [draw(simulator, step, cameras.to(device), background, plan) for step in states]
