@@ -21,7 +21,7 @@ from torch.utils.checkpoint import checkpoint
 
 from gsim3d import ops
 from gsim3d.errors import check_ranges
-from gsim3d.nn.layers import RowLayerNorm, RowLinear
+from gsim3d.nn.layers import RowLayerNorm, RowLinear, widened
 from gsim3d.nn.point_transformer import COLUMN_MULTIPLE, Extension, Head, TransformerConfig
 from gsim3d.ops.curve import Pyramid, PyramidSpec, Segments, Stage
 
@@ -124,7 +124,7 @@ def _ends(nodes: Tensor, n_nodes: int) -> Segments:
 
 
 class Perceptron(nn.Module):
-    """Two linear layers and a norm, of inputs that are padded to whole columns."""
+    """Two linear layers and a norm, of inputs that are padded to whole columns; never returns 16 bits."""
 
     def __init__(self, in_channels: int, channels: int):
         super().__init__()
@@ -134,7 +134,7 @@ class Perceptron(nn.Module):
 
     def forward(self, x: Tensor, residual: Tensor | None = None) -> Tensor:
         x = F.pad(x, (0, self.fc1.in_features - x.shape[1]))
-        return self.norm(self.fc2(F.gelu(self.fc1(x))), residual)
+        return widened(self.norm(self.fc2(F.gelu(self.fc1(x))), residual))
 
 
 class Interaction(nn.Module):

@@ -113,6 +113,26 @@ def test_training_learns_the_motion_of_the_history():
     assert sum(losses[-10:]) / 10 < 0.5 < 0.99 < losses[0]
 
 
+@pytest.mark.parametrize("bits", [0, 1])
+def test_short_histories_and_no_layers(bits):
+    dynamics = make_dynamics(dataclasses.replace(GRAPH, history_bits=bits, graph=GraphConfig(channels=8, layers=0)))
+    history = make_history((20,) * 2**bits)
+    assert dynamics(history).means.isfinite().all()
+    with pytest.raises(ValueError, match="a history must span at most"):
+        dynamics(make_history((20,) * (2**bits + 1)))
+
+
+def test_half_precision_keeps_positions_exact(device):
+    """Far from the origin 16-bit positions would be off by cells."""
+    dynamics, history = make_dynamics(GRAPH).to(device), make_history((40, 30)).to(device)
+    history = history.with_clouds(history.clouds, means=history.means + 64)
+    step = dynamics(history)
+    with torch.autocast(device.type, torch.bfloat16):
+        halved = dynamics(history)
+    assert halved.means.dtype == torch.float32
+    assert_close_relative_to_max(halved.means - history.means[40:], step.means - history.means[40:], 0.05)
+
+
 @pytest.mark.parametrize(
     "changes, message",
     [
