@@ -117,6 +117,9 @@ def test_no_cells():
 def test_errors():
     cells = indices()
     for call, message in {
+        r"2\^15\); got .* 32774": lambda: KernelMap.from_indices(cells + 2**15),
+        r"must be odd .* got \(3, 3, 2\)": lambda: KernelMap.from_indices(cells, (3, 3, 2)),
+        r"stride must be at least 1; got \(2, 0, 1\)": lambda: KernelMap.from_indices(cells, 2, stride=(2, 0, 1)),
         "indices must be an int32 or int64": lambda: KernelMap.from_indices(cells.float()),
         r"indices must be \[N, 4\]": lambda: KernelMap.from_indices(cells[:, :3]),
         r"indices must be in \[0, 2\^15\)": lambda: KernelMap.from_indices(cells - 1),
@@ -131,5 +134,6 @@ def test_errors():
     voxels, kernel_map = KernelMap.from_indices(cells, 2, stride=2)
     with pytest.raises(ValueError, match="x must be"):
         sparse_conv(torch.zeros(3, 1), torch.ones(1, 2, 2, 2, 1), None, voxels, kernel_map)
-    with pytest.raises(ValueError, match="weight's kernel size"):
-        sparse_conv(torch.zeros(len(cells), 1), torch.ones(1, 3, 3, 3, 1), None, voxels, kernel_map)
+    for shape in ((3, 3, 3), (2, 2, 3)):
+        with pytest.raises(ValueError, match="weight's kernel size"):
+            sparse_conv(torch.zeros(len(cells), 1), torch.ones(1, *shape, 1), None, voxels, kernel_map)
