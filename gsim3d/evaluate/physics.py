@@ -101,15 +101,54 @@ def measure_particles(
         first: index of the last given step.
         truth: true nodes [N, 3] of each body at that step, to tell bodies apart; None: one body.
     """
-    clouds = [particles.select_clouds(torch.tensor([step])) for step in range(first, particles.n_clouds)]
-    moving = clouds[0].activity == DYNAMIC
-    if not moving.any():
+    points = moving_points(particles, range(first, particles.n_clouds))
+    if points.shape[1] == 0:
         return {}
-    points = torch.stack([cloud.means[moving] for cloud in clouds]).cpu()
     bodies = torch.zeros(points.shape[1], dtype=torch.int64)
     if truth is not None:
         bodies = nearest_body(points[0], truth)
     return measure(points, bodies, scene.fps, torch.from_numpy(scene.bounds))
+
+
+def moving_points(particles: Particles, steps: Sequence[int]) -> Tensor:
+    """Returns the positions [S, N, 3] of the particles that move in the first of ``steps``, on the CPU.
+
+    Args:
+        particles: one cloud a step, those of ``steps`` with the same particles.
+        steps: indices of clouds.
+    """
+    clouds = [particles.select_clouds(torch.tensor([step])) for step in steps]
+    moving = clouds[0].activity == DYNAMIC
+    return torch.stack([cloud.means[moving] for cloud in clouds]).cpu()
+
+
+def shape_change(points: Tensor, copies: int = 1) -> float:
+    """Returns how far ``copies`` bodies are from their first shapes at the last step: the largest rms in metres.
+
+    Args:
+        points: [S, N, 3] metres, the points of one copy after those of another.
+        copies: number of bodies with equally many points.
+    """
+    bodies = torch.arange(copies).repeat_interleave(points.shape[1] // copies)
+    last = _residuals(points[[0, -1]].double(), bodies)[0]
+    return max(last[bodies == body].square().mean().sqrt().item() for body in range(copies))
+
+
+def fall_ratio(given: Sequence[float], height: float, n_steps: int, fps: float) -> float | None:
+    """Returns how far a body fell over how far a free one would have; None if it is given at one step only.
+
+    Args:
+        given: its mean heights at successive steps, metres; their velocity is fitted under gravity.
+        height: its mean height ``n_steps`` after the last of them.
+        n_steps: number of steps.
+        fps: steps per second.
+    """
+    if len(given) < 2:
+        return None
+    heights, ago = np.asarray(given[:-1]), np.arange(len(given) - 1, 0, -1) / fps
+    velocity = (ago * (given[-1] - GRAVITY / 2 * ago**2 - heights)).sum() / (ago**2).sum()
+    time = n_steps / fps
+    return float((given[-1] - height) / (GRAVITY / 2 * time**2 - velocity * time))
 
 
 def nearest_body(points: Tensor, truth: Sequence[Tensor]) -> Tensor:

@@ -9,11 +9,13 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from torch import Tensor
 
 from gsim3d.baselines import baseline
 from gsim3d.data import Scene
-from gsim3d.effects.edits import Duplicate, Edit, Operation, Remove, Throw, structure_of
+from gsim3d.effects.edits import Duplicate, Edit, Move, Operation, Remove, Throw, structure_of
 from gsim3d.errors import InputError
+from gsim3d.evaluate.physics import fall_ratio, moving_points, shape_change
 from gsim3d.evaluate.pictures import as_bytes, pyplot, save_figure, true_images
 from gsim3d.evaluate.protocol import default_views, horizon, predict, render_steps, score_scene
 from gsim3d.evaluate.scoring import PLAIN_METRICS, measurable
@@ -36,11 +38,14 @@ MAIN, HISTORY, CAMERAS, SPEED, EDITS, TRAINED = (
 )
 REPEATS = {"cpu": 1, "cuda": 5}  # timed calls, after one to warm up
 EDIT_STEPS, SHOWN = 40, 6  # predicted steps of the edits, and how many of them are shown
+FALL_STEPS, RAISE = 20, 0.2  # steps of the fall that is measured; metres by which the ground is raised
+LOWEST = 0.05  # share of a body's points below the height at which it stands
 EDITED: dict[str, Operation | None] = {
     "as it is": None,
     "thrown up": Throw("moving", (0.0, 0.0, 0.06)),
     "duplicated": Duplicate("moving", (0.0, 0.7, 0.2)),
     "ground removed": Remove("frozen"),
+    "ground raised": Move("frozen", (0.0, 0.0, RAISE)),
 }
 METHODS = ("constant", "copy", "constant_velocity")  # baselines that the first model's predictions include
 
@@ -146,28 +151,59 @@ def speed(case: Case) -> dict:
 
 
 def edit(case: Case) -> dict:
-    """Draws the true scene, and its predictions with the edits of EDITED, each from the first predicted step on."""
+    """Predicts the scene with each of EDITED from the first predicted step on; draws and measures it.
+
+    Returns:
+        Numbers as far as the scene has moving particles and steps, shapes as rms to the rigid motion over all steps:
+        "shape_cm" as it is; "copies_cm", the worst of the copies; "fall", the height lost without ground over that of
+        free fall, after FALL_STEPS; "above_cm", how far above the raised ground the body ends.
+    """
     scene, cam = case.scene(), case.targets[:1]
     n_given, n_future = case.restored.n_encoded, min(EDIT_STEPS, horizon(scene, GIVEN, case.n_future))
     steps = np.linspace(n_given, n_given + n_future - 1, min(SHOWN, n_future)).round().astype(int).tolist()
-    rows = {"truth": true_images(scene, cam, steps)[:, 0]}
+    rows, points, heights = {"truth": true_images(scene, cam, steps)[:, 0]}, {}, []
     for name, operation in EDITED.items():
         edits = () if operation is None else (Edit(0, operation),)
         spec = dataclasses.replace(case.restored.plan.spec, structure=structure_of(edits))
         restored = dataclasses.replace(case.restored, plan=case.restored.simulator.plan(spec))
         prediction = predict(restored, scene, default_views(restored, scene, None, case.targets)[0], n_future, 0, edits)
         rows[name] = as_bytes(render_steps(restored, prediction.particles, scene, cam))[steps, 0]
-    size = (1.6 * len(steps), 1.6 * len(rows))
-    figure, panels = pyplot().subplots(len(rows), len(steps), figsize=size, squeeze=False, layout="constrained")
+        points[name] = moving_points(prediction.particles, range(n_given, n_given + n_future))
+        if operation is None:
+            heights = [moving_points(prediction.particles, [step])[0, :, 2].mean().item() for step in range(n_given)]
+    figure = _strip(rows, [f"+{(step - n_given + 1) / scene.fps:.2f} s" for step in steps])
+    save_figure(figure, with_parents(case.figure))
+    return {"numbers": _of_edits(points, heights, scene.fps), "figure": case.figure.name}
+
+
+def _of_edits(points: Mapping[str, Tensor], heights: Sequence[float], fps: float) -> dict[str, float]:
+    """The numbers of :func:`edit`: ``points`` [S, N, 3] of each edit, ``heights`` of the body at the given steps."""
+    alone, copied, falling, raised = (
+        points[name] for name in ("as it is", "duplicated", "ground removed", "ground raised")
+    )
+    if alone.shape[1] == 0:
+        return {}
+    copies = copied.shape[1] // alone.shape[1]
+    found = {"shape_cm": 100 * shape_change(alone), "copies_cm": 100 * shape_change(copied, copies)}
+    if len(falling) >= FALL_STEPS:
+        height = falling[FALL_STEPS - 1, :, 2].mean().item()
+        found["fall"] = fall_ratio(heights, height, FALL_STEPS, fps)
+    found["above_cm"] = 100 * (raised[-1, :, 2].quantile(LOWEST).item() - RAISE)
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def _strip(rows: Mapping[str, np.ndarray], times: Sequence[str]):
+    """Returns a figure of images [S, H, W, 3] by row, with the ``times`` of columns."""
+    size = (1.6 * len(times), 1.6 * len(rows))
+    figure, panels = pyplot().subplots(len(rows), len(times), figsize=size, squeeze=False, layout="constrained")
     for axes_of_row, (name, images) in zip(panels, rows.items(), strict=True):
         axes_of_row[0].set_ylabel(name)
-        for axes, image, step in zip(axes_of_row, images, steps, strict=True):
+        for axes, image, time in zip(axes_of_row, images, times, strict=True):
             axes.imshow(image)
             axes.set(xticks=[], yticks=[])
             if axes in panels[0]:
-                axes.set_title(f"+{(step - n_given + 1) / scene.fps:.2f} s", fontsize=9)
-    save_figure(figure, with_parents(case.figure))
-    return {"numbers": {}, "figure": case.figure.name}
+                axes.set_title(time, fontsize=9)
+    return figure
 
 
 _FITTED = {"of_model": False, "device": "cuda"}

@@ -9,7 +9,7 @@ import torch
 
 from gsim3d.data import Scene
 from gsim3d.errors import InputError
-from gsim3d.evaluate.physics import MEASURES, measure, measure_particles, true_states
+from gsim3d.evaluate.physics import MEASURES, fall_ratio, measure, measure_particles, shape_change, true_states
 from gsim3d.evaluate.report import physics_table, summarize
 from gsim3d.evaluate.scoring import SceneScores
 from gsim3d.state import DYNAMIC, FROZEN, Particles
@@ -54,6 +54,27 @@ def test_penetration_and_permanence():
     points[1, 5:10] = 9.0
     found = measure(points, ONE, 1.0, torch.tensor([[0.0, 0, 0], [1, 1, 1]]))
     assert found["penetration"].item() == pytest.approx(0.05) and found["permanence"].item() == pytest.approx(0.75)
+
+
+def test_the_shape_of_the_worst_copy():
+    generator = np.random.default_rng(2)
+    first = torch.from_numpy(generator.normal(size=(30, 3)))
+    turn, _ = np.linalg.qr(generator.normal(size=(3, 3)))
+    turn = torch.from_numpy(turn * np.sign(np.linalg.det(turn)))
+    bent = first * torch.tensor([1.0, 1.0, 0.9])
+    moved = torch.cat([first @ turn + 3, bent @ turn - 1])
+    both = torch.stack([torch.cat([first, first + 2]), moved])
+    assert shape_change(both[:, :30]) == pytest.approx(0, abs=1e-12)
+    assert shape_change(both, copies=2) == pytest.approx(shape_change(both[:, 30:]))
+    assert 0.02 < shape_change(both, copies=2) < 0.2
+    assert shape_change(both) > 1  # as one body, whose halves move apart
+
+
+def test_a_free_body_falls_freely():
+    heights = [2 + 1.5 * step / 42 - 9.81 / 2 * (step / 42) ** 2 for step in range(24)]
+    assert fall_ratio(heights[:4], heights[23], 20, 42) == pytest.approx(1)
+    assert fall_ratio(heights[:4], heights[3], 20, 42) == pytest.approx(0, abs=1e-12)
+    assert fall_ratio(heights[:1], heights[20], 20, 42) is None
 
 
 def test_points_without_steps_are_refused():

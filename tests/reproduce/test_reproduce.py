@@ -67,6 +67,7 @@ def test_every_row_that_the_data_allow(first, work):
     assert {("Speed", "one"), ("Edits", "two"), ("History length at inference", "two, history 1")} <= lines.keys()
     assert lines[MAIN, "one"]["paper_other_data"] == "33.15 ± 3.51" and not lines[MAIN, "copy"]["paper_other_data"]
     assert lines[MAIN, "two"]["numbers"]["step_ms"] == lines["Speed", "two"]["numbers"]["step_ms"] > 0
+    assert {"shape_cm", "copies_cm", "above_cm"} == lines["Edits", "one"]["numbers"].keys()  # too short for a fall
     page, missing = (work / "out" / "reproduce.md").read_text(), " ".join(content["missing"])
     for text in ("momentum [m/s] | two", "other data", "(figures/main-table-elastic-curves.png)"):
         assert text in page, text
