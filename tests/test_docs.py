@@ -20,7 +20,7 @@ from gsim3d.cli.main import COMMANDS
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
-MOST_WORDS, MOST_LINES = 26_600, 120
+MOST_WORDS, MOST_LINES = 27_000, 120
 NOT_PAGES = {"notes", "_build", "_generated"}
 PAGES = [page for page in sorted(DOCS.rglob("*.md")) if page.relative_to(DOCS).parts[0] not in NOT_PAGES]
 TEXTS = [*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
