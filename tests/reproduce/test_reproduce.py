@@ -24,22 +24,22 @@ from tests.tiny_scenes import write_scenes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 TRAINING = """
-seed: {}
-data: {{history: 2, context_views: 2, target_only_cameras: [3], background_stride: 4}}
+data: {history: 2, context_views: 2, target_only_cameras: [3], background_stride: 4}
 phases:
-  - {{steps: 2, horizon: 1, target_views: 2}}
+  - {steps: 2, horizon: 1, target_views: 2}
 """
+GRAPH = "model: {dynamics: {norm: layer, graph: {channels: 16, layers: 1}}}"
 MAIN = "Main table"
 
 
 @pytest.fixture(scope="module")
 def work(tmp_path_factory, one_thread):
-    """The sets of a world, and two models."""
+    """The sets of a world, and two models: "two" is a graph network."""
     root = tmp_path_factory.mktemp("work")
     write_scenes(root / "sets" / "elastic", 2)
     write_scenes(root / "sets" / "elastic-train", 3)
-    for seed, name in enumerate(("one", "two")):
-        (root / f"{name}.yaml").write_text(TRAINING.format(seed))
+    for name, network in {"one": "", "two": GRAPH}.items():
+        (root / f"{name}.yaml").write_text(TRAINING + network)
         where = {"--data": "sets/elastic-train", "--out": f"runs/{name}", "--export": f"{name}.safetensors"}
         options = [text for option, path in where.items() for text in (option, str(root / path))]
         assert main(["train", str(root / f"{name}.yaml"), *options]) == 0
