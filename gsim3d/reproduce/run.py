@@ -16,7 +16,7 @@ import torch
 from gsim3d import pretrained
 from gsim3d.data import find_scenes
 from gsim3d.errors import CaptureError, FitWarning, InputError, NumericalError
-from gsim3d.evaluate.ablations import Study, base_run, load_ablations
+from gsim3d.evaluate.ablations import Row as Ablation, Study, base_run, load_ablations
 from gsim3d.evaluate.pictures import pyplot
 from gsim3d.evaluate.protocol import default_views
 from gsim3d.evaluate.scoring import measurable
@@ -29,6 +29,8 @@ from gsim3d.reproduce.cells import Cells
 from gsim3d.reproduce.entries import ENTRIES, MAIN, TRAINED, Case, Entry
 from gsim3d.synth import generate
 from gsim3d.synth.held_out import SETS, origin_of
+from gsim3d.synth.worlds import build_world
+from gsim3d.synth.writer import scene_folder
 from gsim3d.train.config import TrainConfig
 from gsim3d.train.restore import Restored, restore
 
@@ -227,12 +229,11 @@ class _Run:
     def train(self, world: str, base: TrainConfig) -> Restored | None:
         """Trains the ablations of a world; returns the model of the first one, the base run, if it is finished."""
         rows, folder = list(load_ablations()[1].values()), self.out / "runs" / world
-        study, reason = None, NO_TIME
-        if time.monotonic() < self._end:
-            try:
-                study = Study(base, rows, self._training_set(world), device=self.job.device)
-            except InputError as error:
-                reason = str(error)
+        study, reason = None, ""
+        try:
+            study = self._study(base, rows, world)
+        except InputError as error:
+            reason = str(error)
         for ablation in rows:
             row = self._row(TRAINED, f"{ablation.name}: {ablation.differs}", world, "", {world: ablation.paper})
             row.seed = base.seed
@@ -261,7 +262,7 @@ class _Run:
                 with warnings.catch_warnings():
                     result = run()
             except (InputError, NumericalError, CaptureError, torch.OutOfMemoryError) as error:
-                reason = str(error).splitlines()[0]
+                reason = str(error).partition("\n")[0] or type(error).__name__
             else:
                 cell = {"asked": asked, "seconds": time.monotonic() - start, "device": self._conditions["device"],
                         "result": result, **result.pop("cost", {})}  # fmt: skip
@@ -282,19 +283,25 @@ class _Run:
 
     def _scene(self, world: str, number: int) -> Path | None:
         """Returns a scene of a world, generated if needed; None if there is no time to."""
+        root, count = self._root(world), self._count(world)
         if self.job.data is not None:
-            folders = find_scenes(self._root(world))
-            return folders[number * len(folders) // self._count(world)]
-        if time.monotonic() > self._end:
+            folders = find_scenes(root)
+            return folders[number * len(folders) // count]
+        options = {"seed": SEED, "n_trajectories": count}
+        folder = scene_folder(root, *build_world(world, "published", options).scenes()[number])
+        if time.monotonic() > self._end and not folder.is_dir():
             return None
-        options = {"preset": "published", "seed": SEED, "n_trajectories": self.job.trajectories, "progress": False}
-        return generate(self._root(world), world, part=(number + 1, self.job.trajectories), **options).folders[0]
+        generate(root, world, preset="published", part=(number + 1, count), progress=False, **options)
+        return folder
 
-    def _training_set(self, world: str) -> list[Path]:
+    def _study(self, base: TrainConfig, rows: Sequence[Ablation], world: str) -> Study:
+        """Returns the ablations of a world. Raises InputError if they do not fit its training set, or it has none."""
         root = self._root(f"{world}{TRAINING}")
         if self.job.data is not None:
-            return find_scenes(root)
-        return generate(root, world, preset="mini", progress=False).folders
+            return Study(base, rows, find_scenes(root), device=self.job.device)
+        if time.monotonic() > self._end and not (root / "manifest.json").is_file():
+            raise InputError(NO_TIME)
+        return Study(base, rows, generate(root, world, preset="mini", progress=False).folders, device=self.job.device)
 
 
 def _trained(study: Study, place: Path, end: float) -> dict:

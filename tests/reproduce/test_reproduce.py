@@ -127,7 +127,10 @@ def test_other_weights_are_compared_with_the_last_run(first, work, tmp_path, no_
     assert lines[MAIN, "copy"]["since_last"] == 0 and one["since_last"] is None
 
 
-def test_a_budget_that_ends_lists_what_is_missing(work, tmp_path):
+def test_a_budget_that_ends_lists_what_is_missing(first, work, tmp_path, no_curves):
+    shutil.copytree(work / "out", tmp_path / "before")
+    content, lines, said = made(work, tmp_path / "before", "one", "two", budget=1e-9)
+    assert len(lines) == len(first[1]) and not said
     content, lines, said = made(work, tmp_path / "out", budget=1e-9)
     assert not lines and not said
     assert any(NO_TIME in line and "one (2)" in line for line in content["missing"])
