@@ -26,6 +26,7 @@ def write_pages(folder: Path) -> None:
         "training_steps": training_steps(),
         "stability": stability(),
         "settings": settings(),
+        "trust": trust(),
         "notebook": notebook(ROOT / "examples" / "predict_look_edit_score.ipynb"),
         **{f"model_{name}": model(name) for name in model_names()},
         **{f"cost_{name}": cost(name) for name in model_names()},
@@ -187,6 +188,30 @@ def training_steps() -> str:
 def stability() -> str:
     """Every hard case, constant and guard."""
     return _tool("stability").page(json.loads((RESULTS / "stability.json").read_text()))
+
+
+def trust() -> str:
+    """How well calibrated bounds hold, and which changed inputs are announced."""
+    results = json.loads((RESULTS / "trust.json").read_text())
+    head = ("set", "scenes", "particles and steps", "mean error m", "area m", "step alone m", "perfect m", "difference")
+    rows = []
+    for name, found in results["sets"].items():
+        for key, label in (("risk_coverage", "all steps"), ("within_steps", "within steps")):
+            areas = [found[key][by] for by in ("trust", "step", "perfect")]
+            counts = found["n_scenes"], f"{found['n_samples']:,}", f"{found['mean_error']:.4f}"
+            numbers = [f"{area:.4f}" for area in areas]
+            rows.append((f"{name}, {label}", *counts, *numbers, f"{areas[0] / areas[1] - 1:+.1%}"))
+    areas = table(head, rows)
+    levels = list(results["sets"]["validation"]["reliability"])
+    rows = [(name, *(f"{s:.0%}" for s in found["reliability"].values())) for name, found in results["sets"].items()]
+    shares = table(("level of the bound", *(f"{float(level):.0%}" for level in levels)), rows)
+    rows = [
+        (name, found["scenes"], found["announced"], ", ".join(f"{m} ({n})" for m, n in found["measures"].items()))
+        for name, found in results["detection"].items()
+    ]
+    detected = table(("inputs", "number", "announced", "measures out of range (inputs)"), rows)
+    titles = "## Risk and coverage", "## Reliability", "## Unfamiliar inputs"
+    return "\n".join(f"{title}\n\n{text}" for title, text in zip(titles, (areas, shares, detected), strict=True))
 
 
 def model_names() -> list[str]:

@@ -12,6 +12,7 @@ from gsim3d.cli.main import main
 from gsim3d.errors import InputError
 from gsim3d.io import checkpoint
 from gsim3d.numerics.speed import SPEEDS_FILE
+from gsim3d.numerics.trust import TRUST_FILE
 from gsim3d.testing.invariances import INVARIANCES
 from gsim3d.train.restore import restore
 
@@ -69,7 +70,7 @@ def test_commands_name_unknown_models(command, capsys, tmp_path, monkeypatch):
 @pytest.mark.parametrize("name", pretrained.names())
 def test_shipped_models_are_complete_and_described(name):
     folder = pretrained.FOLDER / name
-    assert {path.name for path in folder.iterdir()} - {pretrained.LAWS} == {*PARTS, SPEEDS_FILE}
+    assert {path.name for path in folder.iterdir()} - {pretrained.LAWS, TRUST_FILE} == {*PARTS, SPEEDS_FILE}
     weights = load_file(folder / pretrained.WEIGHTS)
     assert all(value.dtype == torch.bfloat16 for value in weights.values())
     assert all(bool(value.isfinite().all()) for value in weights.values())

@@ -106,7 +106,7 @@ def measure_scene(restored: Restored, scene: Scene, start: int = 0) -> dict[str,
 
 def fit_bounds(pairs: Sequence[Samples]) -> dict:
     """Fields of :class:`Trust` that map spread and step to bounds of the error."""
-    spread, step, error = _flat(pairs)
+    spread, step, error = flat(pairs)
     features, target = np.log([spread + LEAST_SPREAD, step]), np.log(error + LEAST_ERROR)
     powers = np.zeros(2)
     for chosen in ([0, 1], [0], [1]):  # the first fit without a negative power
@@ -156,23 +156,36 @@ def fit_ranges(measured: Sequence[dict[str, float]]) -> dict:
 
 
 def risk_coverage(errors: np.ndarray, score: np.ndarray) -> float:
-    """Area under the risk-coverage curve: the mean error of the particles with the lowest scores, over all shares.
+    """Area under the risk-coverage curve of :func:`risks`."""
+    return float(risks(errors, score).mean())
+
+
+def risks(errors: np.ndarray, score: np.ndarray) -> np.ndarray:
+    """Mean error of the 1, 2 ... N particles with the lowest scores: the risk-coverage curve, [N].
 
     Particles of equal score have no order: each counts with their mean error.
     """
     _, group, count = np.unique(score, return_inverse=True, return_counts=True)
     expected = (np.bincount(group, errors) / count)[group[np.argsort(score, kind="stable")]]
-    return float((expected.cumsum() / np.arange(1, len(expected) + 1)).mean())
+    return expected.cumsum() / np.arange(1, len(expected) + 1)
 
 
 def report(trust: Trust, pairs: Sequence[Samples]) -> dict:
-    """How well a calibration holds on scenes: reliability, areas of risk and coverage, errors and bounds by step."""
-    _, step, error = _flat(pairs)
+    """How well a calibration holds on scenes: reliability, areas of risk and coverage, errors and bounds by step.
+
+    "risk_coverage" ranks particles of all steps together, "within_steps" those of each step, averaged over steps; in
+    these the step alone has no order.
+    """
+    _, step, error = flat(pairs)
     spreads = [torch.from_numpy(spread) for spread, _ in pairs]
     score = np.concatenate([trust.score(spread).flatten().numpy() for spread in spreads])
     bounds = {n: np.concatenate([trust.bound(spread, n).flatten().numpy() for spread in spreads]) for n in trust.levels}
-    areas = {name: risk_coverage(error, by) for name, by in (("trust", score), ("step", step), ("perfect", error))}
-    steps = range(1, int(step.max()) + 1)
+    orders, steps = {"trust": score, "step": step, "perfect": error}, range(1, int(step.max()) + 1)
+    areas = {name: risk_coverage(error, by) for name, by in orders.items()}
+    within = {
+        name: float(np.mean([risk_coverage(error[step == n], by[step == n]) for n in steps]))
+        for name, by in orders.items()
+    }
     widest = bounds[max(n for n in trust.levels if n <= 0.9)]
     return {
         "n_scenes": len(pairs),
@@ -180,6 +193,7 @@ def report(trust: Trust, pairs: Sequence[Samples]) -> dict:
         "mean_error": float(error.mean()),
         "reliability": {str(n): float((error <= bound).mean()) for n, bound in bounds.items()},
         "risk_coverage": areas,
+        "within_steps": within,
         "by_step": {
             "error": [float(error[step == n].mean()) for n in steps],
             "bound": [float(widest[step == n].mean()) for n in steps],
@@ -189,12 +203,15 @@ def report(trust: Trust, pairs: Sequence[Samples]) -> dict:
 
 def table(found: dict) -> str:
     """Formats :func:`report` as text."""
-    areas, shares = found["risk_coverage"], found["reliability"]
-    said = ", ".join(f"{float(level):.0%}: {share:.1%}" for level, share in shares.items())
-    area = f"area under the risk-coverage curve {areas['trust']:.4f} m, by step alone {areas['step']:.4f} m "
-    area += f"({areas['trust'] / areas['step'] - 1:+.1%}), perfect {areas['perfect']:.4f} m"
-    count = f"trust, {found['n_scenes']} scenes, {found['n_samples']:,} particles and steps"
-    return f"{count}: {area}\nshare of errors within the bound of each level: {said}"
+    lines = [f"trust, {found['n_scenes']} scenes, {found['n_samples']:,} particles and steps"]
+    for key, label in (("risk_coverage", "all steps together"), ("within_steps", "within steps")):
+        trust, step, perfect = (found[key][name] for name in ("trust", "step", "perfect"))
+        lines.append(
+            f"area under the risk-coverage curve, {label}: {trust:.4f} m, by step alone {step:.4f} m "
+            f"({trust / step - 1:+.1%}), perfect {perfect:.4f} m ({perfect / step - 1:+.1%})"
+        )
+    shares = ", ".join(f"{float(level):.0%}: {share:.1%}" for level, share in found["reliability"].items())
+    return "\n".join([*lines, f"share of errors within the bound of each level: {shares}"])
 
 
 def save_trust(folder: Path, digest: str, trust: Trust) -> Path:
@@ -204,7 +221,7 @@ def save_trust(folder: Path, digest: str, trust: Trust) -> Path:
     return path
 
 
-def _flat(pairs: Sequence[Samples]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def flat(pairs: Sequence[Samples]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Spread, step from 1, and error of all samples."""
     steps = [np.broadcast_to(np.arange(1.0, len(error) + 1)[:, None], error.shape) for _, error in pairs]
     parts = ([spread for spread, _ in pairs], steps, [error for _, error in pairs])

@@ -1,8 +1,8 @@
 """Trained simulators shipped with gsim3d, one folder per model; a folder's name can be used as a checkpoint.
 
 Files: model.safetensors (bfloat16 weights with configuration), config.yaml, training.jsonl (log), recipe.json (training
-data and duration), scores.json, README.md (model card), and laws.json if the model violates invariances of
-docs/results/stability.md (the worst error of each).
+data and duration), scores.json, README.md (model card), laws.json if the model violates invariances of
+docs/results/stability.md (the worst error of each), and trust.json if its errors are calibrated.
 """
 
 from __future__ import annotations

@@ -129,6 +129,8 @@ def test_bounds_rise_and_hold_for_their_share():
     found = calibration.report(made, [(spread, error)])
     assert all(share == pytest.approx(float(level), abs=0.02) for level, share in found["reliability"].items())
     assert found["risk_coverage"]["perfect"] < found["risk_coverage"]["trust"] < 0.8 * found["risk_coverage"]["step"]
+    assert found["within_steps"]["step"] == pytest.approx(error.mean())
+    assert found["within_steps"]["perfect"] < found["within_steps"]["trust"] < 0.8 * error.mean()
     rising = torch.logspace(-6, 0, 50, dtype=torch.float64).expand(5, 50)
     bounds = torch.stack([made.bound(rising, level) for level in made.levels])
     assert all((bounds.diff(dim=axis) >= 0).all() for axis in range(3))

@@ -28,6 +28,7 @@ from gsim3d.errors import InputError  # noqa: E402
 from gsim3d.evaluate.pictures import write_curves  # noqa: E402
 from gsim3d.io import checkpoint  # noqa: E402
 from gsim3d.numerics.speed import SPEEDS_FILE  # noqa: E402
+from gsim3d.numerics.trust import TRUST_FILE  # noqa: E402
 from gsim3d.synth.worlds import VALIDATION_SEED  # noqa: E402
 from gsim3d.train.restore import model_config  # noqa: E402
 from tools.release.recipes import Recipe, recipe  # noqa: E402
@@ -58,9 +59,9 @@ def ship(name: str, made: Recipe, state: Path, scores: Path, limitations: str) -
     folder = pretrained.FOLDER / name
     folder.mkdir(exist_ok=True)
     shutil.copyfile(weights, folder / pretrained.WEIGHTS)
-    speeds = folder / SPEEDS_FILE
-    if speeds.is_file() and saved.digest not in json.loads(speeds.read_text()):
-        speeds.unlink()  # of the weights before
+    for file in (folder / SPEEDS_FILE, folder / TRUST_FILE):
+        if file.is_file() and saved.digest not in json.loads(file.read_text()):
+            file.unlink()  # of the weights before
     (folder / pretrained.LAWS).unlink(missing_ok=True)  # of old weights; measured by gsim3d doctor --stability --full
     (folder / "config.yaml").write_text(yaml.safe_dump(saved.config, sort_keys=False))
     kept = progress.curve[:: max(1, -(-len(progress.curve) // LOGGED))]
