@@ -14,9 +14,8 @@ from tools.release.trust import declare_lens, detection, draw
 
 
 def test_counts_of_announced_inputs():
-    made = Trust(
-        2, 3, 0.5, 1.0, (0.0,), (0.9,), ((0.1,),), {"near depth [m]": (1.0, 0.1), "ground red": (0.5, 0.1)}, 3.0
-    )
+    ranges = {"near depth [m]": (1.0, 0.1), "ground red": (0.5, 0.1)}
+    made = Trust(2, 3, 0.5, 1.0, (0.0,), (0.9,), ((0.1,),), ranges, 3.0)
     found = detection(made, [{"near depth [m]": 1.1, "ground red": 0.6}, {"near depth [m]": 5.0, "ground red": 1.0}])
     assert found == {"scenes": 2, "announced": 1, "measures": {"near depth": 1, "ground red": 1}}
 
