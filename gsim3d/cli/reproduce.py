@@ -13,8 +13,8 @@ DIR, and the paper's value, which is of other data:
 
   Main table                    every model, constant, copy, constant velocity, Spring-Gaus; physical measures
   Speed                         encoding, and a simulated step with its images
-  History length at inference   4, 2 and 1 input steps
-  Input cameras at inference    4, 3, 2 and 1 cameras
+  History length at inference   2 and 1 input steps, beside the model as trained
+  Input cameras at inference    3, 2 and 1 cameras, beside the model as trained
   Edits                         a figure: thrown, duplicated, without ground
   Ablations                     rows of configs/ablations/paper.yaml, trained here (--train)
 

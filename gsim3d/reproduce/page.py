@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -76,7 +77,11 @@ def write(out: Path, rows: Sequence[Row], about: dict) -> tuple[dict, list[Path]
     """Writes reproduce.md, reproduce.json and figures/; returns the content of the JSON file, and the paths."""
     parts, files, lines = [], [], []
     for table, world in dict.fromkeys((row.table, row.world) for row in sorted(rows, key=lambda row: ORDER[row.table])):
-        own = _lines([row for row in rows if (row.table, row.world) == (table, world)])
+        own_rows = [row for row in rows if (row.table, row.world) == (table, world)]
+        if table in (HISTORY, CAMERAS):  # beside each model as trained
+            models = {row.model for row in own_rows if row.cells}
+            own_rows[:0] = [r for r in rows if (r.table, r.world) == (MAIN, world) and r.model in models]
+        own = _lines(own_rows, table)
         if not own:
             continue
         if table == MAIN:
@@ -85,7 +90,7 @@ def write(out: Path, rows: Sequence[Row], about: dict) -> tuple[dict, list[Path]
         parts += [f"## {table}: {world}", _table(own), _remarks(own) if table == MAIN else ""]
         parts += [f"![{path.stem}](figures/{path.name})" for path in pictures]
         files += pictures
-        lines += own
+        lines += [line for line in own if line.row.table == table]
     n_cells, n_missing = (sum(map(len, found)) for found in zip(*((row.cells, row.missing) for row in rows)))
     machine = f"gsim3d {about['gsim3d']}, torch {about['torch']}, on {about['device']}"
     head = [
@@ -103,16 +108,16 @@ def write(out: Path, rows: Sequence[Row], about: dict) -> tuple[dict, list[Path]
     return content, [page, data, *files]
 
 
-def _lines(rows: Sequence[Row]) -> list[Line]:
+def _lines(rows: Sequence[Row], table: str) -> list[Line]:
     """Lines of one table and world, with differences to the first."""
     models = list(dict.fromkeys(row.model for row in rows))
     known = sorted((row for row in rows if row.cells), key=lambda row: models.index(row.model))
     found = [_line(row) for row in known]
-    if known and known[0].table == MAIN and known[0].model:
+    if known and table == MAIN and known[0].model:
         found[1:1] = [_line(known[0], method) for method in METHODS]
-    for line in found:
-        same = [other for other in found if known[0].table == MAIN or other.row.model == line.row.model]
-        line.against = None if line is same[0] or known[0].table == SPEED else _difference(line, same[0].by_scene)
+    for line in found if table != SPEED else ():
+        first = next(other for other in found if table == MAIN or other.row.model == line.row.model)
+        line.against = None if line is first else _difference(line, first.by_scene)
     return found
 
 
@@ -120,8 +125,9 @@ def _line(row: Row, method: str = "") -> Line:
     """The line of a row; with ``method`` that of a baseline in its cells."""
     numbers, by_scene, summary = _numbers(row.cells, method)
     line = Line(row, method or row.label, numbers, by_scene, summary)
-    change = _difference(line, _numbers(row.before, method)[1]) if row.before else None
-    line.last = change and change[0]
+    with contextlib.suppress(KeyError, TypeError, ValueError):  # written by another version
+        change = _difference(line, _numbers(row.before, method)[1]) if row.before else None
+        line.last = change and change[0]
     return line
 
 

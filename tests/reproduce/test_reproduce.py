@@ -72,7 +72,9 @@ def test_every_row_that_the_data_allow(first, work):
     for text in ("momentum [m/s] | two", "other data", "(figures/main-table-elastic-curves.png)"):
         assert text in page, text
     assert "needs --device cuda: spring-gaus (2), spring-gaus-given (2)" in missing
-    assert "trained with 2 input steps of 2 cameras: one, history 4 (2)" in missing
+    assert "trained with 2 input steps of 2 cameras: one, history 2 (2)" in missing
+    fewer = page.split("## Input cameras")[1].split("##")[0]
+    assert fewer.index("| two |") < fewer.index("| two, cameras 1 |") and "| one, cameras 1 |" in fewer
 
 
 def test_scores_are_those_of_evaluate(first, work):
