@@ -22,7 +22,7 @@ from gsim3d.cameras import Cameras, Frames
 from gsim3d.effects.plan import Plan
 from gsim3d.errors import InputError, UnfamiliarInput
 from gsim3d.io.files import MAX_TEXT, read_file
-from gsim3d.io.plain import parse_json
+from gsim3d.io.plain import is_number, parse_json
 from gsim3d.io.settings import from_dict
 from gsim3d.ops.curve import Pyramid
 from gsim3d.ops.raster import rasterize_gaussians
@@ -69,6 +69,11 @@ class Trust:
     def __post_init__(self):
         if not self.scores or [len(row) for row in self.bounds] != [len(self.scores)] * len(self.levels):
             raise InputError("bounds must have a row for each of levels, with a value for each of scores")
+        if list(self.scores) != sorted(self.scores) or self.threshold <= 0:
+            raise InputError("scores must ascend, and threshold must be above 0")
+        for name, pair in self.ranges.items():
+            if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and all(is_number(x, float) for x in pair)):
+                raise InputError(f"ranges: {name} must have a mean and a standard deviation")
 
     def score(self, spread: Tensor, first: int = 1) -> Tensor:
         """Argument of the bound: float64 [S, N], larger for larger expected errors.

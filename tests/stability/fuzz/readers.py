@@ -48,6 +48,7 @@ from gsim3d.nn.multiview_encoder import Encoder
 from gsim3d.nn.multiview_encoder.config import ViTConfig
 from gsim3d.nn.multiview_encoder.depth_weights import load_depth_weights
 from gsim3d.numerics.speed import load_speed
+from gsim3d.numerics.trust import Trust, load_trust
 from gsim3d.simulator import Simulator
 from gsim3d.state import Gaussians, Particles
 from gsim3d.synth.meshes import load_body
@@ -376,6 +377,22 @@ def _read_speeds(folder: Path, what: str) -> None:
     load_times(folder, restored)
 
 
+def _write_trust(folder: Path) -> None:
+    ranges = {"ground red": (0.5, 0.1)}
+    content = {
+        "digest": dataclasses.asdict(
+            Trust(2, 3, 0.5, 1.0, (-5.0, 0.0), (0.5, 0.9), ((0.1, 0.2), (0.2, 0.3)), ranges, 3.0)
+        )
+    }
+    (folder / "trust.json").write_text(json.dumps(content))
+
+
+def _read_trust(folder: Path, what: str) -> None:
+    if trust := load_trust(folder, "digest"):
+        finite([trust.bound(torch.rand(3, 4), level) for level in trust.levels], "bounds")
+        trust.unfamiliar({"ground red": 0.4})
+
+
 def _write_log(folder: Path) -> None:
     lines = [json.dumps({"step": step, "loss": 0.5, "machine": {"step_seconds": 0.1}}) for step in range(4)]
     (folder / LOG).write_text("\n".join(lines) + "\n")
@@ -466,6 +483,7 @@ READERS = {
     "ply_lists_text": Reader(lambda folder: _write_list_ply(folder / "a.ply", "ascii"), _read_ply),
     "meshes": Reader(_write_meshes, _read_meshes),
     "speeds": Reader(_write_speeds, _read_speeds),
+    "trust": Reader(_write_trust, _read_trust),
     "log": Reader(_write_log, lambda folder, what: Log(folder).cut(2)),
     "train_yaml": Reader(
         lambda folder: (folder / "train.yaml").write_text(yaml.safe_dump(TRAINING)),
