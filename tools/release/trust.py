@@ -36,7 +36,7 @@ FRAMES, STEPS, CHANGED_FRAMES = 32, 24, 5  # frames of the sets, predicted steps
 # set -> trajectories, how many of them are predicted, options of the generator
 SETS = {
     "validation": (20, 14, {"seed": VALIDATION_SEED}),
-    "test": (10, 7, {"seed": TEST_SEED}),
+    "test": (14, 14, {"seed": TEST_SEED}),
     "unseen": (8, 8, {"seed": VALIDATION_SEED, "subset": "unseen"}),
 }
 UNDECLARED, TRUE_FOV = "lens, wider than declared", 42.0
