@@ -20,7 +20,7 @@ from gsim3d.evaluate.protocol import Prediction, default_views, input_frames, pr
 from gsim3d.evaluate.report import write_json
 from gsim3d.io.terminal import progress
 from gsim3d.numerics.speed import encode
-from gsim3d.numerics.trust import LEAST_SPREAD, TRUST_FILE, Trust, input_measures, read_trusts
+from gsim3d.numerics.trust import LEAST_SPREAD, TRUST_FILE, Trust, input_measures, read_checkpoints
 from gsim3d.state import DYNAMIC
 from gsim3d.synth.embedding import ParticleCloud
 from gsim3d.train.restore import Restored
@@ -217,7 +217,7 @@ def table(found: dict) -> str:
 def save_trust(folder: Path, digest: str, trust: Trust) -> Path:
     """Writes the calibration of a checkpoint to its folder; returns the file."""
     path = folder / TRUST_FILE
-    write_json(path, {**read_trusts(folder), digest: asdict(trust)})
+    write_json(path, {**read_checkpoints(path), digest: asdict(trust)})
     return path
 
 

@@ -17,10 +17,9 @@ from gsim3d.effects.edits import Edit
 from gsim3d.effects.plan import Plan
 from gsim3d.effects.spec import EffectsSpec, Sleep
 from gsim3d.errors import InputError, check_ranges, did_you_mean
-from gsim3d.io.files import MAX_TEXT, read_file, shown
-from gsim3d.io.plain import parse_json
+from gsim3d.io.files import shown
 from gsim3d.io.settings import from_dict
-from gsim3d.numerics.trust import MOST_LEFT_OUT, check_input, without_oldest
+from gsim3d.numerics.trust import MOST_LEFT_OUT, check_input, read_checkpoints, without_oldest
 from gsim3d.ops.raster import CUTOFFS, Rendering
 from gsim3d.presets import ModelConfig
 from gsim3d.state import DYNAMIC, Particles
@@ -237,16 +236,7 @@ def read_speeds(folder: Path) -> dict[str, Any]:
     Raises:
         InputError: the file is invalid.
     """
-    path = folder / SPEEDS_FILE
-    if not path.is_file():
-        return {}
-    try:
-        content = parse_json(read_file(path, MAX_TEXT))
-    except ValueError as error:
-        raise InputError(f"{path} cannot be read: {error}") from None
-    if not isinstance(content, dict):
-        raise InputError(f"{path} must hold a mapping of checkpoints")
-    return content
+    return read_checkpoints(folder / SPEEDS_FILE)
 
 
 def load_speed(folder: Path, digest: str | None, device: str, speed: str) -> Setting:

@@ -152,13 +152,16 @@ def load_trust(folder: Path, digest: str | None) -> Trust | None:
     Raises:
         InputError: the file is invalid.
     """
-    found = read_trusts(folder).get(digest)
+    found = read_checkpoints(folder / TRUST_FILE).get(digest)
     return None if found is None else from_dict(Trust, found, f"{folder / TRUST_FILE}: ")
 
 
-def read_trusts(folder: Path) -> dict[str, Any]:
-    """Reads all calibrations in ``folder``, {digest: fields of Trust}, empty without a file. Raises InputError."""
-    path = folder / TRUST_FILE
+def read_checkpoints(path: Path) -> dict[str, Any]:
+    """Reads a file of plain values by the digest of a checkpoint, empty without a file.
+
+    Raises:
+        InputError: the file is invalid.
+    """
     if not path.is_file():
         return {}
     try:
