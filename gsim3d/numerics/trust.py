@@ -223,6 +223,9 @@ def rollout_with_spread(
 ) -> tuple[list[Particles], Tensor]:
     """Predicts scenes and their variants in one batched rollout.
 
+    Grids are not shifted with ``background="asymmetric"``, and a graph network has none: such models vary only by
+    histories, which takes three or more input steps.
+
     Args:
         simulator: a :class:`gsim3d.Simulator`.
         histories: see :func:`variants`.
