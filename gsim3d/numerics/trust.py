@@ -157,11 +157,7 @@ def load_trust(folder: Path, digest: str | None) -> Trust | None:
 
 
 def read_checkpoints(path: Path) -> dict[str, Any]:
-    """Reads a file of plain values by the digest of a checkpoint, empty without a file.
-
-    Raises:
-        InputError: the file is invalid.
-    """
+    """Reads plain values by the digest of a checkpoint, {} without a file. Raises InputError if it is invalid."""
     if not path.is_file():
         return {}
     try:
