@@ -15,7 +15,16 @@ from gsim3d.cameras import Frames
 from gsim3d.errors import InputError
 from gsim3d.priors.base import Prior, PriorConfig, StepContext, bounded, hold
 from gsim3d.priors.movable import Movable
-from gsim3d.priors.padding import LEAST_LOGIT, Compact, Samples, from_blocks, gaussian, in_blocks, squared_distances
+from gsim3d.priors.padding import (
+    LEAST_LOGIT,
+    Compact,
+    Samples,
+    block_by_block,
+    from_blocks,
+    gaussian,
+    in_blocks,
+    squared_distances,
+)
 from gsim3d.priors.rigid import SMALLEST, fit_planes
 from gsim3d.state import DYNAMIC, FROZEN, Particles
 
@@ -233,21 +242,25 @@ def particles_between(
     Gradients:
         To ``light``.
     """
-    direction, targets = light / light.norm(), positions
-    positions, there, known = in_blocks(targets, samples.positions, samples.known)
-    with torch.no_grad():
+    direction = light / light.norm()
+
+    def count(positions: Tensor, there: Tensor, known: Tensor) -> tuple[Tensor, ...]:
         ahead = (there * direction).sum(2)[:, None] - (positions * direction).sum(2)[:, :, None]
         off = squared_distances(positions, there).sub_(ahead.square()).clamp_(min=0)
         begun = (ahead - nearest).div_(edge).sigmoid_()
         counted = off.mul_(-0.5 / beam**2).clamp_(min=LEAST_LOGIT).exp_().mul_(begun)
         counted.masked_fill_(~known[:, None], 0)
-        if not direction.requires_grad:
-            return from_blocks(counted.sum(2), targets)
+        if not light.requires_grad:
+            return (counted.sum(2),)
         # d off / d direction = -2 ahead * offset; d ahead / d direction = offset.
         by_way = counted * (ahead / beam**2 + (1 - begun) / edge)
-        slope = by_way @ there - by_way.sum(2, keepdim=True) * positions
-        found = counted.sum(2)
-    return from_blocks(found + slope @ (direction - direction.detach()), targets)
+        return counted.sum(2), by_way @ there - by_way.sum(2, keepdim=True) * positions
+
+    with torch.no_grad():
+        found, *slopes = block_by_block(count, *in_blocks(positions, samples.positions, samples.known))
+    for slope in slopes:
+        found = found + slope @ (direction - direction.detach())
+    return from_blocks(found, positions)
 
 
 def lambert(
@@ -299,15 +312,18 @@ class _Surface:
 
     def __init__(self, positions: Tensor, compact: Compact, samples: Samples, grid_size: float):
         flat, body, kept = FLAT * grid_size, BODY * grid_size, compact.take(positions)
-        blocks, around, known = in_blocks(kept, samples.positions, samples.known[:, None])
-        far = squared_distances(blocks, around)
-        near = torch.where(known, (far * (-0.5 / flat**2)).clamp_(min=LEAST_LOGIT).exp_(), 0)
-        window = near.div_(near.sum(2, keepdim=True).clamp(min=SMALLEST))
-        _, normal = fit_planes(window, around, flat)
-        wide = torch.where(known, far.mul_(-0.5 / body**2).clamp_(min=LEAST_LOGIT).exp_(), 0)
-        wide = wide.div_(wide.sum(2, keepdim=True).clamp(min=SMALLEST))
-        out = ((blocks - wide @ around) * normal).sum(2, keepdim=True)
-        normal, out = (from_blocks(x, kept) for x in (normal, out))
+
+        def fit(blocks: Tensor, around: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+            far = squared_distances(blocks, around)
+            near = torch.where(known, (far * (-0.5 / flat**2)).clamp_(min=LEAST_LOGIT).exp_(), 0)
+            window = near.div_(near.sum(2, keepdim=True).clamp(min=SMALLEST))
+            _, normal = fit_planes(window, around, flat)
+            wide = torch.where(known, far.mul_(-0.5 / body**2).clamp_(min=LEAST_LOGIT).exp_(), 0)
+            wide = wide.div_(wide.sum(2, keepdim=True).clamp(min=SMALLEST))
+            return normal, ((blocks - wide @ around) * normal).sum(2, keepdim=True)
+
+        blocks = in_blocks(kept, samples.positions, samples.known[:, None])
+        normal, out = (from_blocks(x, kept) for x in block_by_block(fit, *blocks))
         self._normal, self._out = compact.put(normal), compact.put(out)[:, :, 0]
 
     def normals(self, direction: Tensor, grid_size: float) -> Tensor:

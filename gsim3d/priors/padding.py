@@ -6,6 +6,7 @@ Shapes: B scenes, M padded particles, m compacted particles, S samples, G nodes.
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -194,6 +195,14 @@ def in_blocks(values: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
     values = F.pad(values, (0, 0, 0, k * SAMPLES - values.shape[1])).unflatten(1, (k, SAMPLES))
     others = (x[:, None].expand(-1, k, *x.shape[1:]) for x in others)
     return tuple(x.flatten(0, 1).contiguous() for x in (values, *others))
+
+
+def block_by_block(f: Callable[..., tuple[Tensor, ...]], *blocks: Tensor) -> tuple[Tensor, ...]:
+    """Applies ``f`` to blocks of :func:`in_blocks`: on a CPU one after another, whose matrices stay in the caches."""
+    if blocks[0].device.type != "cpu" or torch.compiler.is_compiling() or len(blocks[0]) < 2:
+        return f(*blocks)
+    parts = [f(*one) for one in zip(*(x.split(1) for x in blocks))]
+    return tuple(map(torch.cat, zip(*parts)))
 
 
 def from_blocks(blocks: Tensor, like: Tensor) -> Tensor:
