@@ -115,6 +115,14 @@ def test_forward(device, lens, covars, dtype):
         assert_close_relative_to_max(a.cpu()[seen], e[seen], f"projection_{DTYPES[dtype]}", name)
 
 
+def test_the_lower_half_of_covars_is_not_read(device):
+    case = Case(covars=True, device=device)
+    means, covars, *cameras = case.leaves
+    other = covars.triu() + torch.full_like(covars, 7.0).tril(-1)
+    for a, e in zip(pairs_of(case.project(means, other, *cameras)), pairs_of(case.project()), strict=True):
+        assert_same_bits(a, e)
+
+
 @pytest.mark.parametrize("dilation", [0.0, 0.3, 2.0])
 def test_clamped_jacobian_and_any_dilation(device, dilation):
     case = Case()
