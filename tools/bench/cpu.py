@@ -111,6 +111,8 @@ def main() -> None:
     add("--threads", type=int, default=2, help="of each process (default: 2)")
     add("--serve", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args()
+    if args.rounds < 2:
+        parser.error("--rounds: two or more have a spread")
     if args.serve:
         return serve(args.threads)
     if args.other is not None:
