@@ -34,7 +34,7 @@ def test_plan_command_reads_spec_of_scene(capsys, tmp_path):
     scene = write_scene(tmp_path / "set" / "ball" / "0000")
     EffectsSpec(DynamicsEffects("masked_out", 1), AppearanceEffects(0)).save(tmp_path / "set" / "effects.yaml")
     code, out, _ = call(capsys, "plan", scene)
-    assert code == 0 and "preset tiny, untrained; effects: the scene's own" in out
+    assert code == 0 and "preset tiny, untrained, point transformer; effects: the scene's own" in out
     assert not re.search("^(history|background|view_dependent) ", out, re.MULTILINE)
     share = float(re.search(r"^dynamics .* (\d\.\d\d)$", out, re.MULTILINE)[1])
     assert share < 0.5
