@@ -30,7 +30,7 @@ COMMANDS = {  # command -> wanted seconds
 }
 
 
-def serve(threads: int) -> None:
+def serve() -> None:
     """Runs the case of every line of stdin and writes its seconds of wall clock and of the processor."""
     sys.path[0] = str(Path.cwd() / "tools" / "bench")  # of the commit, in place of this file's folder
     import surface_scene
@@ -39,7 +39,7 @@ def serve(threads: int) -> None:
     from gsim3d.presets import small, tiny
     from gsim3d.simulator import Simulator
 
-    torch.set_num_threads(threads)
+    torch.set_num_threads(2)
     views = [surface_scene.evenly(4)] * 4
     frames, places = surface_scene.frames(1, views, 128, masked=True)
     models = {}
@@ -64,10 +64,10 @@ def serve(threads: int) -> None:
         print(json.dumps([time.perf_counter() - start[0], time.process_time() - start[1]]), flush=True)
 
 
-def side(folder: Path, threads: int) -> subprocess.Popen:
+def side(folder: Path) -> subprocess.Popen:
     """The process of a commit; it ends with its stdin."""
     environment = os.environ | {"PYTHONPATH": str(folder), "OMP_WAIT_POLICY": "passive"}
-    command = [sys.executable, __file__, "--serve", "--threads", str(threads)]
+    command = [sys.executable, __file__, "--serve"]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     return subprocess.Popen(command, env=environment, cwd=folder, **pipes)
 
@@ -107,19 +107,17 @@ def main() -> None:
     add = parser.add_argument
     add("--other", type=Path, metavar="FOLDER", help="checkout of another commit, with built extensions")
     add("--scene", type=Path, help="scene folder of 84 steps or more; also times commands")
-    add("--rounds", type=int, default=9, help="of each case (default: 9)")
-    add("--threads", type=int, default=2, help="of each process (default: 2)")
+    add("--rounds", type=int, default=9, help="of each case, at least 2 (default: 9)")
     add("--serve", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.rounds < 2:
-        parser.error("--rounds: two or more have a spread")
+        parser.error("--rounds: must be at least 2")
     if args.serve:
-        return serve(args.threads)
+        return serve()
     if args.other is not None:
         print("| what | ms (spread) | other | ratio | processor ms (spread) | other | ratio | wanted |")
         print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
-        sides = [side(folder, args.threads) for folder in (ROOT, args.other.resolve())]
-        compared(*sides, args.rounds)
+        compared(side(ROOT), side(args.other.resolve()), args.rounds)
     if args.scene is not None:
         print("\n| command | s | processor s | wanted s |\n| --- | ---: | ---: | ---: |")
         commands(args.scene)
