@@ -15,7 +15,7 @@ DIR, and the paper's value, which is of other data:
   Speed                         encoding, and a simulated step with its images
   History length at inference   2 and 1 input steps, beside the model as trained
   Input cameras at inference    3, 2 and 1 cameras, beside the model as trained
-  Edits                         a figure: thrown, duplicated, without ground
+  Edits                         thrown, duplicated, without ground, ground raised: a figure, shapes, fall, landing
   Ablations                     rows of configs/ablations/paper.yaml, trained here (--train)
 
 All methods predict the same steps after 4 given ones and are scored from the same cameras. Without --data, scenes of

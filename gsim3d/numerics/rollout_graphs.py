@@ -19,8 +19,8 @@ class RolloutGraphs:
     """The graph of the last kind of rollout of a simulator. A copy of the simulator begins without one.
 
     A call is of the same kind as the one before if its clouds, fields, plan, number of steps, report, autocast and the
-    memory of the weights are equal. The second call in a row captures the rollout, which takes as long as about four of
-    them; it and those after it replay the graph. Weights that have changed are read again.
+    memory of the weights are equal. The second call in a row captures the rollout, which takes longer than a rollout;
+    it and those after it replay the graph. Weights that have changed are read again.
 
     Attributes:
         obstacle: why the last rollout with ``graph="auto"`` ran step by step; None if it was replayed from a graph.

@@ -9,6 +9,7 @@ from gsim3d.nn.graph_network import GraphConfig
 from gsim3d.ops import PyramidCapacity
 from gsim3d.state import ASLEEP
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
+from tests.cuda_graph import captured
 from tests.dynamics.scenes import EXPLICIT, SEEING, TINY, batch, float_fields, make_dynamics, make_history
 
 MOVING = dataclasses.replace(TINY, priors=SEEING)
@@ -151,21 +152,14 @@ def test_captured_step_with_other_particles(devices):
         with torch.no_grad():
             return dynamics(history, pyramid=dynamics.geometry(history, capacity=capacity))
 
-    side = torch.cuda.Stream()
-    side.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(side):
-        step()
-    torch.cuda.current_stream().wait_stream(side)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        captured = step()
+    graph, results = captured(step)
     for seed in (1, 2):
         other = make_history((400, 300), seed=seed).to(devices[1])
         history.means.copy_(other.means)
         history.dynamic_latents.copy_(other.dynamic_latents)
         graph.replay()
-        assert_same_bits(captured.means, step().means)
+        assert_same_bits(results.means, step().means)
         with torch.no_grad():
             exact = dynamics(history)
-        assert_close_relative_to_max(captured.means, exact.means, "dynamics_order")
-        assert_close_relative_to_max(captured.dynamic_latents, exact.dynamic_latents, "dynamics_order")
+        assert_close_relative_to_max(results.means, exact.means, "dynamics_order")
+        assert_close_relative_to_max(results.dynamic_latents, exact.dynamic_latents, "dynamics_order")

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from gsim3d.ops import PyramidCapacity, build_pyramid
+from tests.cuda_graph import captured
 from tests.ops.test_pyramid import AT_ONCE, LARGE, ONE_CELL, SHUFFLED, SPEC, flat, large_scene, on, scene
 
 # 1 forward against pyramids that fit
@@ -158,14 +159,7 @@ def test_devices_agree_on_given_sizes(spec, release, devices):
 def test_graph_makes_the_pyramid_of_other_positions(devices):
     arguments = on(devices[1], large_scene())
     capacity = PyramidCapacity.of(build_pyramid(**arguments, spec=LARGE), len(arguments["positions"]))
-    side = torch.cuda.Stream()
-    side.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(side):
-        build_pyramid(**arguments, spec=LARGE, capacity=capacity)
-    torch.cuda.current_stream().wait_stream(side)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        given = flat(build_pyramid(**arguments, spec=LARGE, capacity=capacity))
+    graph, given = captured(lambda: flat(build_pyramid(**arguments, spec=LARGE, capacity=capacity)))
     for seed in (1, 2):
         moved = large_scene(seed=seed)["positions"][: len(arguments["positions"])]
         arguments["positions"][: len(moved)] = moved.cuda()

@@ -8,6 +8,7 @@ from tests.asserts import (
     assert_same_bits,
     assert_same_bits_for_any_threads,
 )
+from tests.cuda_graph import captured
 from tests.ops.raster_scene import Scene, facing, gradients, random_scene
 
 OUTPUTS = ("color", "alpha", "depth", "features")
@@ -206,18 +207,11 @@ def test_render_in_a_cuda_graph(devices):
         return [*out, *torch.autograd.grad(out, leaves, cotangents)]
 
     expected = [x.detach() for x in run()]  # a graph kept alive would tie its leaves to this stream
-    side = torch.cuda.Stream()
-    side.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(side):
-        run()
-    torch.cuda.current_stream().wait_stream(side)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        captured = run()
-    for tensor in captured:
+    graph, results = captured(run)
+    for tensor in results:
         tensor.detach().fill_(float("nan"))
     graph.replay()
-    for a, e in zip(captured, expected, strict=True):
+    for a, e in zip(results, expected, strict=True):
         assert_same_bits(a, e)
 
 

@@ -5,6 +5,7 @@ import torch
 from torch.func import vmap
 
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, assert_same_bits_for_any_threads
+from tests.cuda_graph import captured
 from tests.ops.raster_scene import Scene, gradients, random_scene
 from tests.ops.test_raster import operator_args
 
@@ -143,16 +144,9 @@ def test_any_limits_and_a_cuda_graph(devices, limits):
     computed = [x.detach() for x in run()]
     for a, e in zip(computed, expected, strict=True):
         assert_close_relative_to_max(a, e, 1e-5)
-    side = torch.cuda.Stream()
-    side.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(side):
-        run()
-    torch.cuda.current_stream().wait_stream(side)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        captured = run()
+    graph, results = captured(run)
     graph.replay()
-    for a, e in zip(captured, computed, strict=True):
+    for a, e in zip(results, computed, strict=True):
         assert_same_bits(a, e)
 
 

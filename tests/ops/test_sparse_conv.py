@@ -18,6 +18,7 @@ from tests.asserts import (
     gradients,
     relative_to_max,
 )
+from tests.cuda_graph import captured
 from tests.oracle import sparse_conv as oracle
 
 RULES = ["mean", "first"]
@@ -329,18 +330,11 @@ def test_capture_in_a_cuda_graph(devices):
         out = ours(*leaves)
         return [out, *torch.autograd.grad(out, leaves, cotangent)]
 
-    side = torch.cuda.Stream()
-    side.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(side):
-        step()
-    torch.cuda.current_stream().wait_stream(side)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        captured = step()
+    graph, results = captured(step)
     with torch.no_grad():
         leaves[0].copy_(x.flip(0))
     graph.replay()
-    for a, b in zip(captured, gradients(ours, [x.flip(0), weight, bias], cotangent)):
+    for a, b in zip(results, gradients(ours, [x.flip(0), weight, bias], cotangent)):
         assert_same_bits(a, b)
 
 
