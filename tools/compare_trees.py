@@ -8,8 +8,6 @@ Both trees encode the same scenes, simulate 12 steps and take gradients of a rol
 SCENES holds one data set of each world, made by ``gsim3d generate elastic --out SCENES/elastic`` and so on.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import subprocess

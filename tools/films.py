@@ -6,8 +6,6 @@ different times. OUT/truth.json has the true cameras and start times.
 python -m tools.films DATA OUT --cameras 0 1 2
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections.abc import Iterable, Iterator

@@ -3,8 +3,6 @@
 python tools/sizes.py
 """
 
-from __future__ import annotations
-
 import ast
 import sys
 from collections.abc import Iterator

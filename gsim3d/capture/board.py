@@ -3,8 +3,6 @@
 Pixel centres are OpenCV's (integers). The board's axes are OpenCV's too: x along its rows, y down, z into the paper.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

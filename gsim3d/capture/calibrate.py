@@ -1,7 +1,5 @@
 """Implementation of ``gsim3d calibrate``: writes cameras.json of every take of a capture."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections.abc import Callable, Sequence

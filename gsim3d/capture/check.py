@@ -1,7 +1,5 @@
 """Whether a capture can be learned from: angles between its cameras, and the fit of their calibration."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from gsim3d.capture.calibrate import MAX_ERROR

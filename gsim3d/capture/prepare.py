@@ -1,7 +1,5 @@
 """From a capture to scenes that a model trains on: rate, crops, size, strides and depths, and the prepared images."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

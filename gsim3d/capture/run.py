@@ -1,7 +1,5 @@
 """Implementation of ``gsim3d capture``: from films to a trained simulator, in steps that each write their result."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import shutil

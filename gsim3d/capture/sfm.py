@@ -1,7 +1,5 @@
 """Calibration by structure from motion (COLMAP) of the still background of each film."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``gsim3d ablate``: trains and scores ablations."""
 
-from __future__ import annotations
-
 import argparse
 import math
 

@@ -1,7 +1,5 @@
 """Argument parsing shared by all commands: no abbreviations, hints for unknown words, numbers with a range."""
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections.abc import Callable

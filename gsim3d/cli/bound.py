@@ -1,7 +1,5 @@
 """``gsim3d bound``: the score of a perfect simulator."""
 
-from __future__ import annotations
-
 import argparse
 
 from gsim3d.cli.arguments import whole

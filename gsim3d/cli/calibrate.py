@@ -1,7 +1,5 @@
 """``gsim3d calibrate``: cameras of own films, from a ChArUco board or structure from motion."""
 
-from __future__ import annotations
-
 import argparse
 from typing import Any
 

@@ -1,7 +1,5 @@
 """``gsim3d capture``: from own films to a simulator."""
 
-from __future__ import annotations
-
 import argparse
 
 from gsim3d.cli.arguments import number

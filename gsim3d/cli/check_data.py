@@ -1,7 +1,5 @@
 """``gsim3d check-data``: validates recorded scenes, and draws a contact sheet of frames and cameras."""
 
-from __future__ import annotations
-
 import argparse
 
 EPILOG = """\

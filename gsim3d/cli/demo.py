@@ -1,7 +1,5 @@
 """``gsim3d demo``: generates multi-view video and predicts it with a shipped or a new simulator."""
 
-from __future__ import annotations
-
 import argparse
 
 EPILOG = """\

@@ -1,7 +1,5 @@
 """``gsim3d doctor``: checks the installation and runs a self-test of every op."""
 
-from __future__ import annotations
-
 import argparse
 
 from gsim3d.cli.arguments import whole

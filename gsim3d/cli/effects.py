@@ -1,7 +1,5 @@
 """``gsim3d effects infer``: finds the cheapest effects specification without loss of quality on a scene."""
 
-from __future__ import annotations
-
 import argparse
 from functools import partial
 

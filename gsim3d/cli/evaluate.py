@@ -1,7 +1,5 @@
 """``gsim3d evaluate``: scores predictions on a data set."""
 
-from __future__ import annotations
-
 import argparse
 
 from gsim3d.cli.arguments import add_fitting, whole

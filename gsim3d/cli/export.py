@@ -1,7 +1,5 @@
 """``gsim3d export``: Gaussians as a file that other tools open, or as a video."""
 
-from __future__ import annotations
-
 import argparse
 
 from gsim3d.cli.arguments import number, whole

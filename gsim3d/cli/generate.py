@@ -1,7 +1,5 @@
 """`gsim3d generate`: generates a data set of multi-view videos."""
 
-from __future__ import annotations
-
 import argparse
 
 from gsim3d.cli.arguments import number, whole

@@ -1,7 +1,5 @@
 """``gsim3d import``: converts a checkpoint of the authors' release."""
 
-from __future__ import annotations
-
 import argparse
 
 EPILOG = """\

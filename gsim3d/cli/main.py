@@ -1,7 +1,5 @@
 """The ``gsim3d`` command: make and check data, train, simulate, evaluate, import, and tell what is wrong."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import importlib

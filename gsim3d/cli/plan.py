@@ -1,7 +1,5 @@
 """``gsim3d plan``: shows the computations that a model performs for a scene."""
 
-from __future__ import annotations
-
 import argparse
 
 from gsim3d.cli.arguments import add_fitting

@@ -1,7 +1,5 @@
 """``gsim3d profile``: accuracy against time."""
 
-from __future__ import annotations
-
 import argparse
 
 from gsim3d.cli.arguments import number

@@ -1,7 +1,5 @@
 """``gsim3d reproduce``: measures the tables and figures of the paper."""
 
-from __future__ import annotations
-
 import argparse
 
 from gsim3d.cli.arguments import number, whole

@@ -1,7 +1,5 @@
 """``gsim3d simulate``: predict the future of one scene."""
 
-from __future__ import annotations
-
 import argparse
 
 from gsim3d.cli.arguments import add_fitting, number, whole

@@ -1,7 +1,5 @@
 """``gsim3d train``: trains a simulator on a data set."""
 
-from __future__ import annotations
-
 import argparse
 
 from gsim3d.cli.arguments import whole

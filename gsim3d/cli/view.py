@@ -1,7 +1,5 @@
 """``gsim3d view``: look around in a prediction or a scene, in a browser."""
 
-from __future__ import annotations
-
 import argparse
 
 from gsim3d.cli.arguments import add_fitting, number, whole

@@ -1,7 +1,5 @@
 """``gsim3d weights``: installs the weights of perceptual metrics, and of a backbone."""
 
-from __future__ import annotations
-
 import argparse
 
 EPILOG = """\

@@ -4,8 +4,6 @@ A scene folder of any layout may have the file. Its arrays: ``positions``, float
 finite; ``types``, strings [A], the type of each point. Point a at step t is where it was in the images of step t.
 """
 
-from __future__ import annotations
-
 import io
 import tokenize
 import zipfile

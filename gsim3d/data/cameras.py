@@ -3,8 +3,6 @@
 All poses are float64, world-to-camera, OpenCV axes (x right, y down, z forward), pixel centres at +0.5.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Validation of a scene folder, and a contact sheet that shows whether its cameras are correct."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

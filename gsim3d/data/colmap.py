@@ -5,8 +5,6 @@ is its frame number and the rest names its camera; otherwise each image is its o
 in model units. All keys: docs/reference/data.md.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import mmap
 import struct

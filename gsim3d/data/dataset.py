@@ -1,7 +1,5 @@
 """Train/test splits, windows of steps, and packing of images into Frames."""
 
-from __future__ import annotations
-
 import dataclasses
 import zlib
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Conversion of recordings to a model's image size, frame rate, depth range and unit of length."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable

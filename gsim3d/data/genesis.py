@@ -3,8 +3,6 @@
 Cameras are world-to-camera with OpenCV axes; moving cameras have one matrix per step. All keys: docs/reference/data.md.
 """
 
-from __future__ import annotations
-
 import re
 import string
 from collections.abc import Iterator, Sequence

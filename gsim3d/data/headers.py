@@ -1,7 +1,5 @@
 """Parsers of PNG, JPEG, WebP and TIFF headers, so that size and integrity are checked before decoding."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass
 

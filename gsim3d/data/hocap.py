@@ -5,8 +5,6 @@ mask_<frame>.png and no joints. World = the frame of calibration tag 1: metres, 
 docs/reference/data.md.
 """
 
-from __future__ import annotations
-
 import io
 import zipfile
 from collections.abc import Iterator, Sequence

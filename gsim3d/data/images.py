@@ -1,7 +1,5 @@
 """Validated reading of image files, conversion to colours, labels and masks, and a cache of decoded images."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil

@@ -4,8 +4,6 @@ Cameras have Blender's axes (x right, y up, z backwards); the number in a file n
 are movable bodies, other opaque pixels are fixed, transparent ones are background. All keys: docs/reference/data.md.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path

@@ -4,8 +4,6 @@ A layout is a module with NAME, FILE (the name of the description file), ``recog
 ``read(folder, problems) -> Recording``. To support another layout, write such a module and list it here.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from types import ModuleType

@@ -1,7 +1,5 @@
 """Lens distortion models by their published names, and undistortion of images to a pinhole camera."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 

@@ -1,7 +1,5 @@
 """Background subtraction: masks of moving bodies in videos of static cameras."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

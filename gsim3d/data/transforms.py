@@ -4,8 +4,6 @@ Top-level keys are defaults of every frame. Frames without ``camera`` belong to 
 the last number. All keys: docs/reference/data.md.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re

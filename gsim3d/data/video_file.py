@@ -1,7 +1,5 @@
 """Reading of video files: frame times from the container, integrity checks, and frames as RGB images."""
 
-from __future__ import annotations
-
 import os
 import struct
 from collections.abc import Iterator, Sequence

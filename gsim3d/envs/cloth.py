@@ -1,7 +1,5 @@
 """ClothCover: two grippers hold a cloth at two of its corners and lay it over a round region."""
 
-from __future__ import annotations
-
 import os
 from functools import cache
 

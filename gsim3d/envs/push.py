@@ -1,7 +1,5 @@
 """PushToGoal and PushClear: a round pusher among rigid bodies on the ground."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

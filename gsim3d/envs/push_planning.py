@@ -1,7 +1,5 @@
 """What planners need for PushToGoal: dynamics over sequences of pusher velocities, and a cost."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Scenes of environments: what tasks need of a simulated scene, and MuJoCo as the truth."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Protocol

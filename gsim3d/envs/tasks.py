@@ -1,7 +1,5 @@
 """Base of the environments: one episode, or many side by side, in MuJoCo or in a learned simulator."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any, ClassVar

@@ -1,7 +1,5 @@
 """ThrowToTarget: one throw of a rigid body over the ground."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

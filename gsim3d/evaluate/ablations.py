@@ -3,8 +3,6 @@
 A YAML file declares base runs and rows; configs/ablations/paper.yaml contains those of the paper.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

@@ -1,7 +1,5 @@
 """Comparison of two reports on the same scenes: mean difference and paired standard error of each score."""
 
-from __future__ import annotations
-
 import math
 import statistics
 from collections.abc import Iterable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Implementation of ``gsim3d demo``: generates multi-view video and predicts it with a shipped or new simulator."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Iterator

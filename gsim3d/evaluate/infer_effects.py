@@ -1,7 +1,5 @@
 """Search for the cheapest EffectsSpec without loss of quality on a scene (``gsim3d effects infer``)."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterable

@@ -1,7 +1,5 @@
 """Implementation of ``gsim3d evaluate``: scores a checkpoint and predictions of other models, and writes a report."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

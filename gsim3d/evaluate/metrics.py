@@ -3,8 +3,6 @@
 Images are floating point in [0, 1], or uint8, which is divided by 255; other dtypes and ranges are an error.
 """
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor

@@ -4,8 +4,6 @@ Every point has the same weight. Predicted points are particles on visible surfa
 generator's bodies, so compare how measures change rather than their values.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Pictures and videos of predictions."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib
 import os

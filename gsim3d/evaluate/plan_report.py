@@ -1,7 +1,5 @@
 """Report of a plan: active priors, switches and outputs, and predicted costs (``gsim3d plan``)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path

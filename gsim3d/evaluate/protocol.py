@@ -12,8 +12,6 @@ Baselines:
 Predictions of other models (predictions.py) are scored on the same steps, views and scenes.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import warnings

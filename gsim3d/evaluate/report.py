@@ -1,7 +1,5 @@
 """Aggregation of scores over scenes and steps, and reports as JSON, CSV, markdown and text."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -1,7 +1,5 @@
 """Registry of metrics, and per-step scores of the predicted images of one scene."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 

@@ -4,8 +4,6 @@ The error of a particle is its distance from where its body carries it: its last
 nodes of the generator. Errors of encoded positions do not count.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path

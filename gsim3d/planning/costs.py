@@ -3,8 +3,6 @@
 Positions are metres. Sequences share the number of particles: [K, T, N, 3].
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

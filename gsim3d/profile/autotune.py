@@ -1,7 +1,5 @@
 """Finds the fastest setting within an accuracy limit, and saves the tuned presets with the checkpoint."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import asdict

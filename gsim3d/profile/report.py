@@ -1,7 +1,5 @@
 """The report of ``gsim3d profile``: report.json, report.csv, three figures, and a page with all of them."""
 
-from __future__ import annotations
-
 import base64
 import csv
 import io

@@ -1,7 +1,5 @@
 """Measures settings on a benchmark case: first their errors, then their times. A setting may fail."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import random

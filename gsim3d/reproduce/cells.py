@@ -1,7 +1,5 @@
 """Results on disk: a JSON file for each measurement, with those that it replaced."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import os

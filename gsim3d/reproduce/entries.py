@@ -1,7 +1,5 @@
 """The rows of the page: what each needs, how it is measured, and what the paper reports."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

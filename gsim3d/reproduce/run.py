@@ -1,7 +1,5 @@
 """Implementation of ``gsim3d reproduce``: measures what is missing within a budget, and writes the page."""
 
-from __future__ import annotations
-
 import math
 import re
 import time

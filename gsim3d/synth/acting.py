@@ -3,8 +3,6 @@
 Other worlds with actors: synth.gripping, synth.hands.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Bodies by name: procedural shapes, meshes of the package, and meshes of an installed genesis-world."""
 
-from __future__ import annotations
-
 import dataclasses
 import zlib
 from functools import cache

@@ -4,8 +4,6 @@ Simulates the scenes of a generated set again with small errors in the initial s
 compares the images with the ground truth. Does not import torch.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json

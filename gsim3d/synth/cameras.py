@@ -1,7 +1,5 @@
 """Calibrated cameras on two rings around the scene."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Embeddings of surfaces: nodes that an engine moves, and surface points bound to them at frame 0."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

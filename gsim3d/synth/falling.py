@@ -1,7 +1,5 @@
 """Base class of worlds whose bodies fall or are thrown at time 0."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Surfaces are embedded in the particles of their bodies. Genesis does not guarantee equal bits in repeated runs.
 """
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The world cloth-grip: one or two grippers hold a cloth and move it. Each gripper is one point."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 

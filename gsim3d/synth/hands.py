@@ -4,8 +4,6 @@ The motion is prescribed, without forces: the body moves with the hands while th
 Keypoints are in the usual order: the wrist, then four of each finger from its base to its tip.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 

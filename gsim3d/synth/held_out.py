@@ -1,7 +1,5 @@
 """Held-out sets for model selection and test scores: trajectories with reserved seeds."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass

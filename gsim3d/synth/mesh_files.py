@@ -3,8 +3,6 @@
 OBJ files are parsed here, since trimesh silently drops materials, colours and lines that it does not support.
 """
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Callable

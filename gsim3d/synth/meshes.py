@@ -1,7 +1,5 @@
 """Bodies from mesh files with textures, and their collision meshes and convex pieces."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

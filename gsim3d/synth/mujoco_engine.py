@@ -1,7 +1,5 @@
 """Simulation with MuJoCo: soft bodies are trilinear flexes, rigid bodies convex meshes, and cloth is a 2D flex."""
 
-from __future__ import annotations
-
 import os
 
 import numpy as np

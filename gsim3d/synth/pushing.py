@@ -1,7 +1,5 @@
 """Simulation of rigid bodies on a ground with a kinematic spherical pusher, by MuJoCo."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass

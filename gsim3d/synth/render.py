@@ -4,8 +4,6 @@ The ground is a disc, whose hit points and colours are computed once a scene. Th
 Embree scene a frame, for all cameras.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Generation of data sets with several processes and reproducible bytes."""
 
-from __future__ import annotations
-
 import dataclasses
 import multiprocessing
 import os

@@ -1,7 +1,5 @@
 """Input of an engine (bodies, cloth and ground at time 0, in SI units), and checks of its output."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

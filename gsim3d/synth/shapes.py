@@ -3,8 +3,6 @@
 The bounding box of a body is centred at the origin, and the body fits a sphere of diameter 1.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Base class of worlds: options, and the random draw, simulation, checks and rendering of a scene."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import importlib

@@ -1,7 +1,5 @@
 """The worlds elastic, rigid and cloth, and the list of all; presets and held-out sets are in assets/presets.yaml."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ OUT/manifest.json; OUT/effects.yaml (see gsim3d.effects.spec). A scene is writte
 when complete.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -4,8 +4,6 @@ compare_sleep(simulator, state, 12, plan, cameras)   # a plan with sleep against
 compare_backgrounds(simulator, state, 12, cameras)   # an asymmetric model against a symmetric one with its weights
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Checks of the installation and self-tests of all ops (``gsim3d doctor``). Works without torch."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.metadata
 import platform

@@ -8,8 +8,6 @@ amplify rounding, so invariances with a bound are checked for each step of a rol
 checked for the whole rollout.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass

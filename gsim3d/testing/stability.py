@@ -1,7 +1,5 @@
 """Invariances and stress tests of a model on scenes, with files that reproduce failures (``gsim3d doctor``)."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

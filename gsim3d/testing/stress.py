@@ -3,8 +3,6 @@
 As in :mod:`gsim3d.testing.invariances`, a check is a function (simulator, sample) -> deviations.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Iterator

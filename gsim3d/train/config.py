@@ -1,7 +1,5 @@
 """Configuration of a training run. Attributes of each class are the keys of the YAML file of `gsim3d train`."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path

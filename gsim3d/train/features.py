@@ -1,7 +1,5 @@
 """Features of a frozen backbone, computed once per input of a run and kept in memory."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 from collections import OrderedDict

@@ -1,7 +1,5 @@
 """Gradients of a training step: truncated backpropagation, activation checkpointing, norms and statistics."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext

@@ -1,7 +1,5 @@
 """Images of the input cameras, each drawn from the particles of the other cameras."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 

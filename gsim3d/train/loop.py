@@ -1,7 +1,5 @@
 """The training loop. A step depends only on (weights, configuration, step), so a resumed run has equal bits."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import signal

@@ -1,7 +1,5 @@
 """The training loss: image errors weighted over time."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """AdamW for many small tensors, learning-rate schedule, weight averaging, loss scaling and deterministic mode."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections import defaultdict

@@ -1,7 +1,5 @@
 """Distributed training: division of a batch among processes, and their communication."""
 
-from __future__ import annotations
-
 import atexit
 import hashlib
 import os

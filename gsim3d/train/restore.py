@@ -1,7 +1,5 @@
 """Building of simulators from training configurations and checkpoints, and fitting of scenes to them."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import warnings

@@ -1,7 +1,5 @@
 """Implementation of ``gsim3d train``: starts or resumes a training run of one or several processes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path

@@ -3,8 +3,6 @@
 Processes of a run exchange heartbeats; if the launcher or a process is lost, the others exit.
 """
 
-from __future__ import annotations
-
 import os
 import selectors
 import signal

@@ -10,8 +10,6 @@ distance to the goal, steps of solved episodes, seconds of a plan, and for ``mod
 median error of the body's center at each of the H steps of its plans, beside that of a body that does not move.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -10,8 +10,6 @@ the last layers predict little more than that bodies sink on and that Gaussians 
 they are 5 cm wide, and each is in sight of a quarter of all pixels).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence

@@ -9,8 +9,6 @@ where particles lie are those of surface_scene.py. With several processes every 
 efficiency of scaling is the time of a step in one process, measured before they begin, over the time in all of them.
 """
 
-from __future__ import annotations
-
 import argparse
 import functools
 import json

@@ -1,7 +1,5 @@
 """Recipes of the simulators that are trained for release: configs/train/WORLD.yaml, and arms with priors beside it."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """One run: a trainer that goes by the clock, on trajectories that data workers make meanwhile."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import time

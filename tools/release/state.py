@@ -7,8 +7,6 @@ weights: a run starts with a warm-up. ``NAME.weights.safetensors`` beside it is 
 in bfloat16, to predict with; the state does not need it.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

@@ -1,7 +1,5 @@
 """Scores of validation trajectories during a training run: masked PSNR of given and predicted steps, scene by scene."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Validation of images and conversion to colours in [0, 1]."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

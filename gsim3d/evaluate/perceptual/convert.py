@@ -1,7 +1,5 @@
 """Conversion of published weight files to state dicts of LPIPS, I3D and DINOv2, without executing their code."""
 
-from __future__ import annotations
-
 import io
 import pickle
 from collections.abc import Iterator

@@ -7,8 +7,6 @@ Source:
     Unterthiner et al. 2018, "Towards accurate generative models of video: a new metric and challenges".
 """
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor

@@ -7,8 +7,6 @@ Source:
     Carreira and Zisserman 2017, "Quo vadis, action recognition? A new model and the Kinetics dataset".
 """
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn

@@ -7,8 +7,6 @@ Source:
     Zhang et al. 2018, "The unreasonable effectiveness of deep features as a perceptual metric".
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -5,8 +5,6 @@ plain arrays (convert.py) and stored as safetensors in the user's cache: ``$GSIM
 ``$XDG_CACHE_HOME/gsim3d``, else ``~/.cache/gsim3d``.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import subprocess
