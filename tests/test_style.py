@@ -105,6 +105,7 @@ def documented_fields():
                 fields = [f for f in node.body if isinstance(f, ast.AnnAssign) and "ClassVar" not in ast.unparse(f)]
                 documented = set(sections(ast.get_docstring(node) or "").get("Attributes", []))
                 documented |= {f.target.id for f in fields if "#: " in lines[f.end_lineno - 1]}
+                documented |= {f.target.id for f in fields if lines[f.lineno - 2].lstrip().startswith("#: ")}
                 bases = [ast.unparse(base).rpartition(".")[2] for base in node.bases]
                 known[node.name] = documented, bases
                 found.append((name, node.name, [f.target.id for f in fields], documented, bases))

@@ -27,21 +27,13 @@ SHARP = 2  # rays along each side of a pixel
 
 @dataclass(frozen=True)
 class Damage:
-    """What films suffer from.
+    """What films suffer from."""
 
-    Attributes:
-        lens: k1 k2 p1 p2 k3.
-        noise: standard deviation, of 255.
-        exposure: largest relative deviation of a colour channel of a camera.
-        dropped: fraction of frames.
-        late: largest number of frames that a film begins late.
-    """
-
-    lens: tuple[float, ...] = (-0.12, 0.04, 0.001, -0.0005, 0.0)
-    noise: float = 3.0
-    exposure: float = 0.1
-    dropped: float = 0.02
-    late: int = 6
+    lens: tuple[float, ...] = (-0.12, 0.04, 0.001, -0.0005, 0.0)  #: k1 k2 p1 p2 k3
+    noise: float = 3.0  #: standard deviation, of 255
+    exposure: float = 0.1  #: largest relative deviation of a colour channel of a camera
+    dropped: float = 0.02  #: fraction of frames
+    late: int = 6  #: largest number of frames that a film begins late
 
 
 def rays(K: np.ndarray, lens: Iterable[float], size: tuple[int, int], samples: int = 1) -> np.ndarray:

@@ -18,19 +18,12 @@ PACKAGE_LIMIT = 22_500 + 2_200 + 900 + 1_800
 
 
 class Size(NamedTuple):
-    """One size and its limit.
+    """One size and its limit."""
 
-    Attributes:
-        what: what is counted.
-        value: how many.
-        limit: the largest value that is allowed.
-        where: where the largest one is; empty where all are counted together.
-    """
-
-    what: str
-    value: int
-    limit: int
-    where: str = ""
+    what: str  #: what is counted
+    value: int  #: how many
+    limit: int  #: the largest value that is allowed
+    where: str = ""  #: where the largest one is; empty where all are counted together
 
     @property
     def holds(self) -> bool:

@@ -42,41 +42,23 @@ LATE_MEANS = 1.6e-6  # rate of the positions in the dynamic stage
 
 @dataclass(frozen=True)
 class SpringGausConfig:
-    """Settings of a fit; the defaults are the published ones for synthetic scenes.
+    """Settings of a fit; the defaults are the published ones for synthetic scenes."""
 
-    Attributes:
-        fit_frames: frames that are fitted; None: as many as the model is given; 0: all of the scene.
-        anchors: largest number of anchors.
-        neighbors: springs of each anchor.
-        edge: metres, of the voxels whose centres are anchors.
-        stiffness: first value of each anchor.
-        damping: along the springs, constant; none while the velocity is fitted.
-        substeps: of a frame; ``more_substeps`` are added at a third and two thirds of the dynamic stage.
-        more_substeps: see above; also added where a number is not finite.
-        static_iterations: of Adam on frame 0.
-        refine_iterations: of appearance with bound positions, before each of the two next stages.
-        velocity_iterations: passes through the frames before contact.
-        dynamic_iterations: passes through all fitted frames.
-        hit_frame: frames of the velocity stage.
-        ground: metres, height of the ground along z.
-        seed: of anchors and cameras.
-    """
-
-    fit_frames: int | None = 24
-    anchors: int = 2048
-    neighbors: int = 256
-    edge: float = 0.01
-    stiffness: float = 1000.0
-    damping: float = 0.1
-    substeps: int = 100
-    more_substeps: int = 50
-    static_iterations: int = 3000
-    refine_iterations: int = 1000
-    velocity_iterations: int = 100
-    dynamic_iterations: int = 300
-    hit_frame: int = 4
-    ground: float = 0.0
-    seed: int = 123
+    fit_frames: int | None = 24  #: frames that are fitted; None: as many as the model is given; 0: all of the scene
+    anchors: int = 2048  #: largest number of anchors
+    neighbors: int = 256  #: springs of each anchor
+    edge: float = 0.01  #: metres, of the voxels whose centres are anchors
+    stiffness: float = 1000.0  #: first value of each anchor
+    damping: float = 0.1  #: along the springs, constant; none while the velocity is fitted
+    substeps: int = 100  #: of a frame; ``more_substeps`` are added at a third and two thirds of the dynamic stage
+    more_substeps: int = 50  #: see above; also added where a number is not finite
+    static_iterations: int = 3000  #: of Adam on frame 0
+    refine_iterations: int = 1000  #: of appearance with bound positions, before each of the two next stages
+    velocity_iterations: int = 100  #: passes through the frames before contact
+    dynamic_iterations: int = 300  #: passes through all fitted frames
+    hit_frame: int = 4  #: frames of the velocity stage
+    ground: float = 0.0  #: metres, height of the ground along z
+    seed: int = 123  #: of anchors and cameras
 
 
 BASELINES = {

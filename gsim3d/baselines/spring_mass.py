@@ -24,29 +24,18 @@ MOST_SUBSTEPS = 500
 
 @dataclass(frozen=True)
 class Springs:
-    """Anchors at rest and the springs between them.
+    """Anchors at rest and the springs between them."""
 
-    Attributes:
-        rest: [N, 3] metres, positions at frame 0.
-        neighbors: int64 [N, k], the nearest other anchors, nearest first; a directed graph.
-        lengths: [N, k] metres, rest lengths.
-    """
-
-    rest: Tensor
-    neighbors: Tensor
-    lengths: Tensor
+    rest: Tensor  #: [N, 3] metres, positions at frame 0
+    neighbors: Tensor  #: int64 [N, k], the nearest other anchors, nearest first; a directed graph
+    lengths: Tensor  #: [N, k] metres, rest lengths
 
 
 class SpringState(NamedTuple):
-    """What moves.
+    """What moves."""
 
-    Attributes:
-        positions: [N, 3] metres.
-        velocities: [N, 3] m/s.
-    """
-
-    positions: Tensor
-    velocities: Tensor
+    positions: Tensor  #: [N, 3] metres
+    velocities: Tensor  #: [N, 3] m/s
 
 
 def build_springs(points: Tensor, *, n_anchors: int, n_neighbors: int, edge: float, seed: int) -> Springs:

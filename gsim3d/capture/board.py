@@ -23,21 +23,13 @@ OUT_OF_PAPER = np.diag([1.0, -1.0, -1.0])  # axes of a board -> world axes, with
 
 @dataclass(frozen=True)
 class Board:
-    """A ChArUco board.
+    """A ChArUco board."""
 
-    Attributes:
-        columns: squares along x.
-        rows: squares along y.
-        square: side of a square in metres.
-        marker: side of a marker in metres; 0: 0.75 squares.
-        dictionary: OpenCV's name of the markers, such as "4X4_50".
-    """
-
-    columns: int
-    rows: int
-    square: float
-    marker: float = 0.0
-    dictionary: str = "4X4_50"
+    columns: int  #: squares along x
+    rows: int  #: squares along y
+    square: float  #: side of a square in metres
+    marker: float = 0.0  #: side of a marker in metres; 0: 0.75 squares
+    dictionary: str = "4X4_50"  #: OpenCV's name of the markers, such as "4X4_50"
 
     def made(self):
         """Returns the board as an object of OpenCV; raises InputError if its measures are invalid."""
@@ -57,25 +49,15 @@ class Board:
 
 @dataclass(frozen=True)
 class Calibrated:
-    """A calibrated camera.
+    """A calibrated camera."""
 
-    Attributes:
-        name: camera.
-        size: (width, height) in pixels.
-        K: [3, 3], pixels.
-        distortion: OpenCV's k1 k2 p1 p2 k3.
-        viewmat: [4, 4], world-to-camera, metres.
-        error: root mean squared reprojection error in pixels.
-        views: number of images that it rests on.
-    """
-
-    name: str
-    size: tuple[int, int]
-    K: np.ndarray
-    distortion: np.ndarray
-    viewmat: np.ndarray
-    error: float
-    views: int
+    name: str  #: camera
+    size: tuple[int, int]  #: (width, height) in pixels
+    K: np.ndarray  #: [3, 3], pixels
+    distortion: np.ndarray  #: OpenCV's k1 k2 p1 p2 k3
+    viewmat: np.ndarray  #: [4, 4], world-to-camera, metres
+    error: float  #: root mean squared reprojection error in pixels
+    views: int  #: number of images that it rests on
 
 
 @dataclass

@@ -27,17 +27,11 @@ GRID = 4  # samples of the motion a frame
 
 @dataclass(frozen=True)
 class Film:
-    """One film of a take.
+    """One film of a take."""
 
-    Attributes:
-        name: camera, the name of the file without its ending.
-        size: (width, height) in pixels.
-        video: its frames and their times.
-    """
-
-    name: str
-    size: tuple[int, int]
-    video: Video
+    name: str  #: camera, the name of the file without its ending
+    size: tuple[int, int]  #: (width, height) in pixels
+    video: Video  #: its frames and their times
 
     @classmethod
     def open(cls, file: Path) -> Film:

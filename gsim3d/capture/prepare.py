@@ -33,27 +33,17 @@ HELD_OUT_SHARE = 0.15  # of a single take, its last steps
 
 @dataclass(frozen=True)
 class Proposal:
-    """What a capture is turned into.
+    """What a capture is turned into."""
 
-    Attributes:
-        fps: frames per second.
-        size: (width, height) of the images in pixels.
-        crops: left, top, width and height of the crop of each camera, in pixels of the working images.
-        working_size: (width, height) of these images; None: as recorded.
-        bounds: corners [2][3] of the box in which bodies move, metres; None: unknown.
-        near_far: depth range in metres.
-        body_stride: every n-th row and column of pixels becomes a particle.
-        held_out_camera: camera that is only a target; None: every camera is an input.
-    """
-
-    fps: float
-    size: tuple[int, int]
+    fps: float  #: frames per second
+    size: tuple[int, int]  #: (width, height) of the images in pixels
+    #: left, top, width and height of the crop of each camera, in pixels of the working images
     crops: tuple[tuple[int, int, int, int], ...]
-    working_size: tuple[int, int] | None
-    bounds: list | None
-    near_far: tuple[float, float]
-    body_stride: int
-    held_out_camera: int | None
+    working_size: tuple[int, int] | None  #: (width, height) of these images; None: as recorded
+    bounds: list | None  #: corners [2][3] of the box in which bodies move, metres; None: unknown
+    near_far: tuple[float, float]  #: depth range in metres
+    body_stride: int  #: every n-th row and column of pixels becomes a particle
+    held_out_camera: int | None  #: camera that is only a target; None: every camera is an input
 
 
 def open_take(folder: Path, cache: Path) -> Scene:

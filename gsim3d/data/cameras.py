@@ -128,17 +128,11 @@ def nearest_point(centres: np.ndarray, directions: np.ndarray) -> np.ndarray | N
 
 @dataclass(frozen=True)
 class _Convergence:
-    """Statistics of cameras relative to their focus point, the point closest to all optical axes.
+    """Statistics of cameras relative to their focus point, the point closest to all optical axes."""
 
-    Attributes:
-        behind: bool [N], whether the focus point lies behind a camera.
-        error: RMS distance of the axes from the focus point, over the mean camera distance.
-        plausible: fraction of the cameras with the focus point in front of them, at a plausible distance.
-    """
-
-    behind: np.ndarray
-    error: float
-    plausible: float
+    behind: np.ndarray  #: bool [N], whether the focus point lies behind a camera
+    error: float  #: RMS distance of the axes from the focus point, over the mean camera distance
+    plausible: float  #: fraction of the cameras with the focus point in front of them, at a plausible distance
 
     @property
     def fits(self) -> bool:

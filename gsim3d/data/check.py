@@ -30,17 +30,11 @@ EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).bit_count(
 
 @dataclass(frozen=True)
 class SceneCheck:
-    """Result of :func:`check_scene`.
+    """Result of :func:`check_scene`."""
 
-    Attributes:
-        path: scene folder.
-        scene: the opened scene; None if it could not be opened.
-        problems: one message per line, in the order found.
-    """
-
-    path: Path
-    scene: Scene | None
-    problems: tuple[str, ...]
+    path: Path  #: scene folder
+    scene: Scene | None  #: the opened scene; None if it could not be opened
+    problems: tuple[str, ...]  #: one message per line, in the order found
 
 
 def check_scene(folder: str | Path) -> SceneCheck:

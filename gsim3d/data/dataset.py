@@ -163,21 +163,13 @@ def _join_cameras(cameras: list[Cameras], image_cloud: list[int]) -> Cameras:
 
 @dataclasses.dataclass(frozen=True)
 class Window:
-    """Consecutive steps of one scene: ``n_context`` input steps, followed by steps to predict.
+    """Consecutive steps of one scene: ``n_context`` input steps, followed by steps to predict."""
 
-    Attributes:
-        scene: the scene.
-        start: index of the first step.
-        n_context: number of input steps.
-        context_cams: camera indices of each input step.
-        target_cams: camera indices of each step, input steps included.
-    """
-
-    scene: Scene
-    start: int
-    n_context: int
-    context_cams: tuple[tuple[int, ...], ...]
-    target_cams: tuple[tuple[int, ...], ...]
+    scene: Scene  #: the scene
+    start: int  #: index of the first step
+    n_context: int  #: number of input steps
+    context_cams: tuple[tuple[int, ...], ...]  #: camera indices of each input step
+    target_cams: tuple[tuple[int, ...], ...]  #: camera indices of each step, input steps included
 
     @property
     def steps(self) -> list[int]:

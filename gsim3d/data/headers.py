@@ -14,19 +14,12 @@ MAX_TAGS, MAX_VALUES = 1000, 1 << 20
 
 @dataclass(frozen=True)
 class Header:
-    """Header of an image file.
+    """Header of an image file."""
 
-    Attributes:
-        size: (width, height) in pixels.
-        whole: whether the file is complete (not truncated).
-        alpha: whether the image has an alpha channel or transparent colour.
-        refused: why the image is not supported; "" if it is.
-    """
-
-    size: tuple[int, int]
-    whole: bool
-    alpha: bool = False
-    refused: str = ""
+    size: tuple[int, int]  #: (width, height) in pixels
+    whole: bool  #: whether the file is complete (not truncated)
+    alpha: bool = False  #: whether the image has an alpha channel or transparent colour
+    refused: str = ""  #: why the image is not supported; "" if it is
 
 
 def read_header(data: bytes) -> Header | None:

@@ -42,15 +42,10 @@ class Problems:
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """Lens distortion in OpenCV's parametrisation.
+    """Lens distortion in OpenCV's parametrisation."""
 
-    Attributes:
-        coefficients: k1 k2 p1 p2 [k3 [k4 k5 k6]], or k1 k2 k3 k4 of the fisheye model.
-        fisheye: whether it is the fisheye model.
-    """
-
-    coefficients: np.ndarray
-    fisheye: bool = False
+    coefficients: np.ndarray  #: k1 k2 p1 p2 [k3 [k4 k5 k6]], or k1 k2 k3 k4 of the fisheye model
+    fisheye: bool = False  #: whether it is the fisheye model
 
     def __eq__(self, other) -> bool:
         same = isinstance(other, Lens) and self.fisheye == other.fisheye
@@ -59,17 +54,11 @@ class Lens:
 
 @dataclass(frozen=True, eq=False)
 class RecordedActions:
-    """Points of actors at every step of a recording.
+    """Points of actors at every step of a recording."""
 
-    Attributes:
-        positions: float64 [T, A, 3] metres.
-        types: type of each point.
-        present: bool [T, A], where a point is.
-    """
-
-    positions: np.ndarray
-    types: tuple[str, ...]
-    present: np.ndarray
+    positions: np.ndarray  #: float64 [T, A, 3] metres
+    types: tuple[str, ...]  #: type of each point
+    present: np.ndarray  #: bool [T, A], where a point is
 
     def every(self, stride: int) -> RecordedActions:
         """Returns the actions at every ``stride``-th step."""
@@ -78,21 +67,13 @@ class RecordedActions:
 
 @dataclass(frozen=True)
 class Camera:
-    """One camera of a recording, in gsim3d's conventions.
+    """One camera of a recording, in gsim3d's conventions."""
 
-    Attributes:
-        name: name for messages.
-        size: (width, height) of its images.
-        viewmats: world-to-camera [4, 4], or [n_steps, 4, 4] if it moves.
-        Ks: [3, 3], or [n_steps, 3, 3].
-        lens: distortion; None for a pinhole.
-    """
-
-    name: str
-    size: tuple[int, int]
-    viewmats: np.ndarray
-    Ks: np.ndarray
-    lens: Lens | None = None
+    name: str  #: name for messages
+    size: tuple[int, int]  #: (width, height) of its images
+    viewmats: np.ndarray  #: world-to-camera [4, 4], or [n_steps, 4, 4] if it moves
+    Ks: np.ndarray  #: [3, 3], or [n_steps, 3, 3]
+    lens: Lens | None = None  #: distortion; None for a pinhole
 
 
 @dataclass(frozen=True)
@@ -170,17 +151,11 @@ def _by_step(matrices: Sequence[np.ndarray], n_steps: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Description:
-    """A JSON object with validating accessors.
+    """A JSON object with validating accessors."""
 
-    Attributes:
-        values: the object.
-        where: prefix of error messages, such as "metadata.json: cam_0.".
-        problems: receives the errors found.
-    """
-
-    values: Mapping[str, Any]
-    where: str
-    problems: Problems
+    values: Mapping[str, Any]  #: the object
+    where: str  #: prefix of error messages, such as "metadata.json: cam_0."
+    problems: Problems  #: receives the errors found
 
     def whole(self, key: str, limit: int) -> int:
         """Returns an integer from 1 to ``limit``; 1 on error."""

@@ -76,15 +76,10 @@ class Video:
 
 @dataclass(frozen=True)
 class _Scan:
-    """Result of decoding a file.
+    """Result of decoding a file."""
 
-    Attributes:
-        times: float64 [N] seconds, of all decodable frames.
-        rate: frames per second in the header; may be invalid.
-    """
-
-    times: np.ndarray
-    rate: float
+    times: np.ndarray  #: float64 [N] seconds, of all decodable frames
+    rate: float  #: frames per second in the header; may be invalid
 
 
 @lru_cache(maxsize=10_000)
@@ -187,15 +182,10 @@ def _even_rate(times: np.ndarray, header: float) -> float | None:
 
 @dataclass(frozen=True)
 class _Index:
-    """Container metadata that OpenCV does not report.
+    """Container metadata that OpenCV does not report."""
 
-    Attributes:
-        mirrored: whether the display matrix of an MP4 mirrors the image.
-        duration: seconds of the video track after edit lists; None if unknown.
-    """
-
-    mirrored: bool = False
-    duration: float | None = None
+    mirrored: bool = False  #: whether the display matrix of an MP4 mirrors the image
+    duration: float | None = None  #: seconds of the video track after edit lists; None if unknown
 
 
 def _index(file: Path) -> _Index:

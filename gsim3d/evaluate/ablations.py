@@ -47,19 +47,12 @@ errors it is a tie. The paper's numbers are for its own data and budget: compare
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One row of the table.
+    """One row of the table."""
 
-    Attributes:
-        name: name of the row and of the folder of its runs.
-        differs: description of the difference from the base run.
-        paper: published PSNR in dB; "" if there is none.
-        change: settings that replace those of the base run.
-    """
-
-    name: str
-    differs: str
-    paper: str = ""
-    change: dict = dataclasses.field(default_factory=dict)
+    name: str  #: name of the row and of the folder of its runs
+    differs: str  #: description of the difference from the base run
+    paper: str = ""  #: published PSNR in dB; "" if there is none
+    change: dict = dataclasses.field(default_factory=dict)  #: settings that replace those of the base run
 
 
 def load_ablations(path: Path = PAPER) -> tuple[dict[str, TrainConfig], dict[str, Row]]:

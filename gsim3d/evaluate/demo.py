@@ -31,16 +31,10 @@ _phase = partial(PhaseConfig, batch=2, target_views=2, warm_up=0.1)
 
 @dataclass(frozen=True)
 class DemoConfig:
-    """Configuration of a demo.
+    """Configuration of a demo."""
 
-    Attributes:
-        preset: data preset of gsim3d.synth.
-        data: options that override those of the preset.
-        train: training configuration.
-        simulator: name of a shipped simulator to use; None trains a new one.
-    """
-
-    preset: str = "mini"
+    preset: str = "mini"  #: data preset of gsim3d.synth
+    #: options that override those of the preset
     data: dict[str, Any] = field(default_factory=lambda: {"n_frames": 18, "fps": 16.0, "image_size": 64})
     train: TrainConfig = TrainConfig(
         preset="tiny",
@@ -56,8 +50,8 @@ class DemoConfig:
         workers=2,
         checkpoint_every=50,
         log_every=1,
-    )
-    simulator: str | None = None
+    )  #: training configuration
+    simulator: str | None = None  #: name of a shipped simulator to use; None trains a new one
 
 
 SHIPPED = DemoConfig(

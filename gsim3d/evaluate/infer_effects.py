@@ -25,23 +25,14 @@ Measured = tuple[float, float]  # PSNR in dB, seconds per step
 
 @dataclass(frozen=True)
 class Proposal:
-    """Result of :func:`infer`.
+    """Result of :func:`infer`."""
 
-    Attributes:
-        spec: the smallest spec within the tolerance.
-        measured: PSNR in dB and seconds per step with ``spec``.
-        before: PSNR in dB and seconds per step with the checkpoint's spec.
-        constant_psnr: PSNR in dB of the constant baseline, the last encoded particles.
-        n_cameras: number of target cameras.
-        table: (effect, setting, gain in dB, cost in ms, note) of every setting.
-    """
-
-    spec: EffectsSpec
-    measured: Measured
-    before: Measured
-    constant_psnr: float
-    n_cameras: int
-    table: list[tuple[str, ...]]
+    spec: EffectsSpec  #: the smallest spec within the tolerance
+    measured: Measured  #: PSNR in dB and seconds per step with ``spec``
+    before: Measured  #: PSNR in dB and seconds per step with the checkpoint's spec
+    constant_psnr: float  #: PSNR in dB of the constant baseline, the last encoded particles
+    n_cameras: int  #: number of target cameras
+    table: list[tuple[str, ...]]  #: (effect, setting, gain in dB, cost in ms, note) of every setting
 
     def __str__(self) -> str:
         (psnr, seconds), (now, faster) = self.before, self.measured

@@ -22,17 +22,11 @@ MARGIN = 0.5  # metres around the scene's bounds
 
 @dataclass(frozen=True)
 class Measure:
-    """A physical measure.
+    """A physical measure."""
 
-    Attributes:
-        label: name and unit in tables.
-        formula: definition, with v the velocity from the step before, x the position, and <> the mean over points.
-        digits: number of decimals in tables.
-    """
-
-    label: str
-    formula: str
-    digits: int
+    label: str  #: name and unit in tables
+    formula: str  #: definition, with v the velocity from the step before, x the position, and <> the mean over points
+    digits: int  #: number of decimals in tables
 
 
 MEASURES = {

@@ -48,20 +48,13 @@ CLIPS = 48  # default number of clips for FVD
 
 @dataclass(frozen=True)
 class Prediction:
-    """Encoded and predicted particles of one scene.
+    """Encoded and predicted particles of one scene."""
 
-    Attributes:
-        particles: one cloud per step; the first ``n_encoded`` are encoded, the others predicted.
-        n_encoded: number of encoded steps.
-        context_cams: input cameras.
-        resting: fraction of the predicted particles that were at rest and skipped.
-        spread: [S - n_encoded, N] metres, see :func:`gsim3d.numerics.trust.rollout_with_spread`; None: not computed.
-    """
-
-    particles: Particles
-    n_encoded: int
-    context_cams: tuple[int, ...]
-    resting: float = 0.0
+    particles: Particles  #: one cloud per step; the first ``n_encoded`` are encoded, the others predicted
+    n_encoded: int  #: number of encoded steps
+    context_cams: tuple[int, ...]  #: input cameras
+    resting: float = 0.0  #: fraction of the predicted particles that were at rest and skipped
+    #: [S - n_encoded, N] metres, see :func:`gsim3d.numerics.trust.rollout_with_spread`; None: not computed
     spread: Tensor | None = None
 
     @property

@@ -15,21 +15,14 @@ from gsim3d.evaluate.perceptual import fvd, lpips, weights
 
 @dataclass(frozen=True)
 class Metric:
-    """A metric of predicted images.
+    """A metric of predicted images."""
 
-    Attributes:
-        label: name in tables.
-        digits: number of decimals in tables.
-        rises: whether higher is better.
-        weights: weights that it needs, a key of gsim3d.evaluate.perceptual.weights.SOURCES; None if it needs none.
-        by_step: whether it has a value for each image.
-    """
-
-    label: str
-    digits: int
-    rises: bool = True
+    label: str  #: name in tables
+    digits: int  #: number of decimals in tables
+    rises: bool = True  #: whether higher is better
+    #: weights that it needs, a key of gsim3d.evaluate.perceptual.weights.SOURCES; None if it needs none
     weights: str | None = None
-    by_step: bool = True
+    by_step: bool = True  #: whether it has a value for each image
 
 
 METRICS = {
@@ -52,30 +45,21 @@ RING_WIDTH = 0.3  # in diameters of the body
 
 @dataclass(frozen=True)
 class SceneScores:
-    """Scores of one scene.
+    """Scores of one scene."""
 
-    Attributes:
-        scene: name of the scene.
-        n_encoded: number of input steps.
-        n_steps: number of all steps, S.
-        values: method -> metric -> float64 [S], mean over the target views at each step. Steps before ``n_encoded`` are
-            reconstructions of the model and NaN for other methods; steps with empty masks are NaN.
-        clips: method (and ``"truth"``) -> I3D features [V, 400] of the predicted steps in each target view, for FVD.
-        not_measured: metric -> reason why it has no value.
-        body_share: float64 [S], fraction of the foreground covered by bodies, mean over the target views; None without
-            labels.
-        digest: hash of the true images and labels.
-        physics: method (and ``"truth"``) -> measure of :mod:`gsim3d.evaluate.physics` -> float64 [S - n_encoded].
-    """
-
-    scene: str
-    n_encoded: int
-    n_steps: int
+    scene: str  #: name of the scene
+    n_encoded: int  #: number of input steps
+    n_steps: int  #: number of all steps, S
+    #: method -> metric -> float64 [S], mean over the target views at each step. Steps before ``n_encoded`` are
+    #: reconstructions of the model and NaN for other methods; steps with empty masks are NaN.
     values: dict[str, dict[str, Tensor]]
+    #: method (and ``"truth"``) -> I3D features [V, 400] of the predicted steps in each target view, for FVD
     clips: dict[str, Tensor]
-    not_measured: dict[str, str]
+    not_measured: dict[str, str]  #: metric -> reason why it has no value
+    #: float64 [S], fraction of the foreground covered by bodies, mean over the target views; None without labels
     body_share: Tensor | None = None
-    digest: str = ""
+    digest: str = ""  #: hash of the true images and labels
+    #: method (and ``"truth"``) -> measure of :mod:`gsim3d.evaluate.physics` -> float64 [S - n_encoded]
     physics: dict[str, dict[str, Tensor]] = field(default_factory=dict)
 
 

@@ -124,21 +124,14 @@ def _changed(simulator: Simulator, setting: Setting) -> Simulator:
 
 @dataclass(frozen=True)
 class Group:
-    """Settings that vary one quantity.
+    """Settings that vary one quantity."""
 
-    Attributes:
-        name: name of the quantity.
-        kind: key of KINDS.
-        settings: case -> settings; empty if the model or device does not support any.
-        needs: requirement for a non-empty list.
-        few: number of settings in a quick report, evenly spaced over the list and including its last one.
-    """
-
-    name: str
-    kind: str
+    name: str  #: name of the quantity
+    kind: str  #: key of KINDS
+    #: case -> settings; empty if the model or device does not support any
     settings: Callable[[BenchmarkCase], list[Setting]]
-    needs: str = ""
-    few: int = 2
+    needs: str = ""  #: requirement for a non-empty list
+    few: int = 2  #: number of settings in a quick report, evenly spaced over the list and including its last one
 
 
 def _precisions(case: BenchmarkCase) -> list[Setting]:

@@ -40,23 +40,15 @@ NO_TIME = "no time left"
 
 @dataclass(frozen=True)
 class Effort:
-    """Number of measurements.
+    """Number of measurements."""
 
-    Attributes:
-        n_rounds: passes over all settings, each in a different order; at least 3 separate differences from noise.
-        repeats: timed steps and timed encodings in each round.
-        warm_up: untimed calls in each round.
-        n_steps: predicted steps that are compared; None: all.
-        n_scenes: scenes that are compared; None: all.
-        few: limits each group to its ``Group.few`` settings.
-    """
-
+    #: passes over all settings, each in a different order; at least 3 separate differences from noise
     n_rounds: int = 3
-    repeats: int = 7
-    warm_up: int = 1
-    n_steps: int | None = None
-    n_scenes: int | None = None
-    few: bool = False
+    repeats: int = 7  #: timed steps and timed encodings in each round
+    warm_up: int = 1  #: untimed calls in each round
+    n_steps: int | None = None  #: predicted steps that are compared; None: all
+    n_scenes: int | None = None  #: scenes that are compared; None: all
+    few: bool = False  #: limits each group to its ``Group.few`` settings
 
 
 QUICK = Effort(n_steps=12, n_scenes=2, few=True)
@@ -76,52 +68,31 @@ class TimeLimit:
 
 @dataclass(frozen=True)
 class Agreement:
-    """Agreement of a setting with the reference run.
+    """Agreement of a setting with the reference run."""
 
-    Attributes:
-        psnr: mean PSNR of the images in dB.
-        psnr_worst: lowest PSNR of an image in dB.
-        position_mean: mean distance of moving particles over all steps, in cells; None if the particle sets differ.
-        position_max: largest such distance.
-    """
-
-    psnr: float
-    psnr_worst: float
+    psnr: float  #: mean PSNR of the images in dB
+    psnr_worst: float  #: lowest PSNR of an image in dB
+    #: mean distance of moving particles over all steps, in cells; None if the particle sets differ
     position_mean: float | None
-    position_max: float | None
+    position_max: float | None  #: largest such distance
 
 
 @dataclass(eq=False)
 class Point:
-    """A setting and its measurements.
+    """A setting and its measurements."""
 
-    Attributes:
-        setting: how the simulator runs.
-        group: name of its group.
-        kind: key of KINDS.
-        failure: reason why there is no result, or "".
-        agreement: agreement with the reference run.
-        task: metric -> score against the video: mean over scenes, then over steps.
-        by_step: metric -> score at each step.
-        encode: timings of the encoding of the input, one a round.
-        step: timings of one simulated step with its images, one a round.
-        capture_seconds: seconds of the graph capture before the first step.
-        peak_bytes: GPU memory in bytes that a step allocates on top of model and input; 0 on a CPU.
-        resting_share: fraction of sleeping particles.
-    """
-
-    setting: Setting
-    group: str
-    kind: str
-    failure: str = ""
-    agreement: Agreement | None = None
-    task: dict = field(default_factory=dict)
-    by_step: dict = field(default_factory=dict)
-    encode: tuple[Timing, ...] = ()
-    step: tuple[Timing, ...] = ()
-    capture_seconds: float = 0.0
-    peak_bytes: int = 0
-    resting_share: float = 0.0
+    setting: Setting  #: how the simulator runs
+    group: str  #: name of its group
+    kind: str  #: key of KINDS
+    failure: str = ""  #: reason why there is no result, or ""
+    agreement: Agreement | None = None  #: agreement with the reference run
+    task: dict = field(default_factory=dict)  #: metric -> score against the video: mean over scenes, then over steps
+    by_step: dict = field(default_factory=dict)  #: metric -> score at each step
+    encode: tuple[Timing, ...] = ()  #: timings of the encoding of the input, one a round
+    step: tuple[Timing, ...] = ()  #: timings of one simulated step with its images, one a round
+    capture_seconds: float = 0.0  #: seconds of the graph capture before the first step
+    peak_bytes: int = 0  #: GPU memory in bytes that a step allocates on top of model and input; 0 on a CPU
+    resting_share: float = 0.0  #: fraction of sleeping particles
 
     @property
     def step_seconds(self) -> float:
@@ -169,17 +140,11 @@ def reason(error: Exception) -> str:
 
 @dataclass(frozen=True)
 class Rollout:
-    """A predicted scene of S steps and V views.
+    """A predicted scene of S steps and V views."""
 
-    Attributes:
-        images: [S, V, H, W, 3] in [0, 1].
-        moving: S tensors [n, 3], positions of the moving particles.
-        resting_share: fraction of sleeping particles.
-    """
-
-    images: Tensor
-    moving: list[Tensor]
-    resting_share: float = 0.0
+    images: Tensor  #: [S, V, H, W, 3] in [0, 1]
+    moving: list[Tensor]  #: S tensors [n, 3], positions of the moving particles
+    resting_share: float = 0.0  #: fraction of sleeping particles
 
 
 class BenchmarkCase:

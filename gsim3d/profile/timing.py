@@ -223,14 +223,10 @@ class _TimedOp:
 
 @dataclass(frozen=True)
 class Timing:
-    """Durations of repeated calls.
+    """Durations of repeated calls."""
 
-    Attributes:
-        repeats: seconds of each call, in order.
-        sections: section -> median seconds; empty if sections were not recorded.
-    """
-
-    repeats: tuple[float, ...]
+    repeats: tuple[float, ...]  #: seconds of each call, in order
+    #: section -> median seconds; empty if sections were not recorded
     sections: dict[str, float] = field(default_factory=dict)
 
     @property

@@ -50,23 +50,14 @@ METHODS = ("constant", "copy", "constant_velocity")  # baselines that the first 
 
 @dataclass(frozen=True)
 class Case:
-    """One model (or none) and one scene.
+    """One model (or none) and one scene."""
 
-    Attributes:
-        restored: the model; None for methods that are fitted to the scene.
-        folder: folder of the scene.
-        targets: cameras from which all methods are scored.
-        n_future: number of predicted steps; None: to the end of the scene.
-        figure: file of a picture.
-        device: "cpu" or "cuda".
-    """
-
-    restored: Restored | None
-    folder: Path
-    targets: Sequence[int]
-    n_future: int | None
-    figure: Path
-    device: str
+    restored: Restored | None  #: the model; None for methods that are fitted to the scene
+    folder: Path  #: folder of the scene
+    targets: Sequence[int]  #: cameras from which all methods are scored
+    n_future: int | None  #: number of predicted steps; None: to the end of the scene
+    figure: Path  #: file of a picture
+    device: str  #: "cpu" or "cuda"
 
     def scene(self) -> Scene:
         """Opens the scene. Raises InputError if the model scales its images: other rows are scored on the original."""
@@ -80,26 +71,17 @@ class Case:
 
 @dataclass(frozen=True)
 class Entry:
-    """A row of a table.
+    """A row of a table."""
 
-    Attributes:
-        table: title of the table.
-        row: name of the row; {model} is replaced by the model's name.
-        run: measures a case. Returns "scores" of :func:`gsim3d.reproduce.cells.to_json`, or "numbers" by column, and
-            perhaps "by_scene" (scene -> value that is compared) and "figure".
-        paper: world -> published value.
-        of_model: whether it is measured for each model, or once for each world.
-        first_only: whether it is measured on the first scene only.
-        device: device that it needs; None: any.
-    """
-
-    table: str
-    row: str
+    table: str  #: title of the table
+    row: str  #: name of the row; {model} is replaced by the model's name
+    #: measures a case. Returns "scores" of :func:`gsim3d.reproduce.cells.to_json`, or "numbers" by column, and perhaps
+    #: "by_scene" (scene -> value that is compared) and "figure".
     run: Callable[[Case], dict]
-    paper: Mapping[str, str] = field(default_factory=dict)
-    of_model: bool = True
-    first_only: bool = False
-    device: str | None = None
+    paper: Mapping[str, str] = field(default_factory=dict)  #: world -> published value
+    of_model: bool = True  #: whether it is measured for each model, or once for each world
+    first_only: bool = False  #: whether it is measured on the first scene only
+    device: str | None = None  #: device that it needs; None: any
 
 
 def score(case: Case, methods: Sequence[str] = (), plain: bool = True, **setting) -> dict:

@@ -52,25 +52,17 @@ cost instead."""
 
 @dataclass
 class Line:
-    """A line of a table.
+    """A line of a table."""
 
-    Attributes:
-        row: the row that it belongs to; baselines share that of the first model.
-        label: its name.
-        numbers: keys of COLUMNS -> value.
-        by_scene: scene -> value that is compared: masked PSNR (PSNR without masks), or milliseconds.
-        summary: see :func:`gsim3d.evaluate.report.summarize`; {} for rows without images.
-        against: (mean, standard error) of the difference to the first line of the table or model; None for the first.
-        last: mean change since the last run; None if there was none.
-    """
-
-    row: Row
-    label: str
-    numbers: dict[str, float]
-    by_scene: dict[str, float]
+    row: Row  #: the row that it belongs to; baselines share that of the first model
+    label: str  #: its name
+    numbers: dict[str, float]  #: keys of COLUMNS -> value
+    by_scene: dict[str, float]  #: scene -> value that is compared: masked PSNR (PSNR without masks), or milliseconds
+    #: see :func:`gsim3d.evaluate.report.summarize`; {} for rows without images
     summary: dict = field(default_factory=dict)
+    #: (mean, standard error) of the difference to the first line of the table or model; None for the first
     against: tuple[float, float | None] | None = None
-    last: float | None = None
+    last: float | None = None  #: mean change since the last run; None if there was none
 
 
 def write(out: Path, rows: Sequence[Row], about: dict) -> tuple[dict, list[Path]]:

@@ -43,58 +43,34 @@ Models = dict[str, dict[str, Restored]]  # world -> name -> model
 
 @dataclass(frozen=True)
 class Job:
-    """The options of ``gsim3d reproduce``.
+    """The options of ``gsim3d reproduce``."""
 
-    Attributes:
-        out: folder of sets, cells, page and figures; created, or continued.
-        models: "[WORLD=]CHECKPOINT"; without WORLD scored in all worlds. None: the shipped simulators.
-        worlds: worlds; None: those of ``data``, else WORLDS.
-        data: folder with a folder of scenes for each world; None: sets are generated in ``out``.
-        trajectories: number of scenes of each world.
-        steps: number of steps to predict; None: to the end.
-        budget: minutes; None: unlimited. What is being measured when it ends is completed.
-        train: optimizer steps of each ablation (0: those of the base run); None: nothing is trained.
-        preset: base run of the ablations; None: PRESET of :mod:`gsim3d.evaluate.ablations`.
-        device: "cpu" or "cuda".
-    """
-
-    out: str
+    out: str  #: folder of sets, cells, page and figures; created, or continued
+    #: "[WORLD=]CHECKPOINT"; without WORLD scored in all worlds. None: the shipped simulators.
     models: Sequence[str] = ()
-    worlds: Sequence[str] | None = None
-    data: str | None = None
-    trajectories: int = 6
-    steps: int | None = None
-    budget: float | None = None
-    train: int | None = None
-    preset: str | None = None
-    device: str = "cpu"
+    worlds: Sequence[str] | None = None  #: worlds; None: those of ``data``, else WORLDS
+    data: str | None = None  #: folder with a folder of scenes for each world; None: sets are generated in ``out``
+    trajectories: int = 6  #: number of scenes of each world
+    steps: int | None = None  #: number of steps to predict; None: to the end
+    budget: float | None = None  #: minutes; None: unlimited. What is being measured when it ends is completed.
+    train: int | None = None  #: optimizer steps of each ablation (0: those of the base run); None: nothing is trained
+    preset: str | None = None  #: base run of the ablations; None: PRESET of :mod:`gsim3d.evaluate.ablations`
+    device: str = "cpu"  #: "cpu" or "cuda"
 
 
 @dataclass
 class Row:
-    """A row of a table, and what is known of it.
+    """A row of a table, and what is known of it."""
 
-    Attributes:
-        table: title of the table.
-        label: name of the row.
-        world: its world.
-        model: name of the model; "" for a method that is fitted to each scene.
-        paper: published value.
-        seed: seed of the scenes, or of the training; None: unknown.
-        cells: scene -> cell.
-        before: scene -> the cell that it replaced.
-        missing: scene -> reason.
-    """
-
-    table: str
-    label: str
-    world: str
-    model: str
-    paper: str = ""
-    seed: int | None = None
-    cells: dict[str, dict] = field(default_factory=dict)
-    before: dict[str, dict] = field(default_factory=dict)
-    missing: dict[str, str] = field(default_factory=dict)
+    table: str  #: title of the table
+    label: str  #: name of the row
+    world: str  #: its world
+    model: str  #: name of the model; "" for a method that is fitted to each scene
+    paper: str = ""  #: published value
+    seed: int | None = None  #: seed of the scenes, or of the training; None: unknown
+    cells: dict[str, dict] = field(default_factory=dict)  #: scene -> cell
+    before: dict[str, dict] = field(default_factory=dict)  #: scene -> the cell that it replaced
+    missing: dict[str, str] = field(default_factory=dict)  #: scene -> reason
 
 
 def reproduce(job: Job, command: str, say: Callable[[str], None] = print) -> tuple[dict, list[Path]]:

@@ -33,17 +33,11 @@ TRIES = 50
 
 @dataclass(frozen=True)
 class PushPolicy:
-    """A closed-loop policy of a pusher: a sequence of legs, each to push a body to a goal, or to go to a place.
+    """A closed-loop policy of a pusher: a sequence of legs, each to push a body to a goal, or to go to a place."""
 
-    Attributes:
-        start: first position [2] in metres.
-        speed: speed in m/s.
-        legs: (body, or -1 for none, and goal [2] in metres) in order.
-    """
-
-    start: np.ndarray
-    speed: float
-    legs: tuple[tuple[int, np.ndarray], ...]
+    start: np.ndarray  #: first position [2] in metres
+    speed: float  #: speed in m/s
+    legs: tuple[tuple[int, np.ndarray], ...]  #: (body, or -1 for none, and goal [2] in metres) in order
 
     def run(self, simulation: pushing.PushSimulation, n_frames: int) -> tuple[np.ndarray, np.ndarray]:
         """Runs a simulation. Returns the nodes of the bodies [T, B, 4, 3] and the pusher's center [T, 3] in metres."""

@@ -34,19 +34,12 @@ METRICS = ("psnr_masked", "psnr_body")
 
 @dataclass(frozen=True)
 class StartErrors:
-    """Magnitudes of the errors of each body at the last input step; directions are random.
+    """Magnitudes of the errors of each body at the last input step; directions are random."""
 
-    Attributes:
-        velocity: error of the velocity in m/step.
-        place: error of the position in metres; the name is part of stored results.
-        angle: error of the orientation in rad.
-        spin: error of the spin, relative.
-    """
-
-    velocity: float
-    place: float = 0.0
-    angle: float = 0.0
-    spin: float = 0.0
+    velocity: float  #: error of the velocity in m/step
+    place: float = 0.0  #: error of the position in metres; the name is part of stored results
+    angle: float = 0.0  #: error of the orientation in rad
+    spin: float = 0.0  #: error of the spin, relative
 
 
 _SOFT = StartErrors(velocity=0.42e-3, place=2e-3, angle=10e-3)

@@ -7,21 +7,13 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Rig:
-    """The cameras of a scene.
+    """The cameras of a scene."""
 
-    Attributes:
-        viewmats: world-to-camera matrices [V, 4, 4], OpenCV axes (x right, y down, z forward).
-        Ks: intrinsics [V, 3, 3] in pixels, pixel centres at +0.5.
-        size: width and height of the images in pixels.
-        near: smallest visible depth in metres.
-        far: largest visible depth in metres.
-    """
-
-    viewmats: np.ndarray
-    Ks: np.ndarray
-    size: int
-    near: float
-    far: float
+    viewmats: np.ndarray  #: world-to-camera matrices [V, 4, 4], OpenCV axes (x right, y down, z forward)
+    Ks: np.ndarray  #: intrinsics [V, 3, 3] in pixels, pixel centres at +0.5
+    size: int  #: width and height of the images in pixels
+    near: float  #: smallest visible depth in metres
+    far: float  #: largest visible depth in metres
 
     @property
     def n_cams(self) -> int:

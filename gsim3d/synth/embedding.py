@@ -9,15 +9,10 @@ NEIGHBOURS = 12  # particles that a point is bound to; an affine motion needs fo
 
 @dataclass(frozen=True)
 class Binding:
-    """Points as weighted sums of nodes.
+    """Points as weighted sums of nodes."""
 
-    Attributes:
-        corners: int64 [N, K], indices of the flattened nodes.
-        weights: [N, K], rows sum to 1; some are negative for points outside the convex hull of the nodes.
-    """
-
-    corners: np.ndarray
-    weights: np.ndarray
+    corners: np.ndarray  #: int64 [N, K], indices of the flattened nodes
+    weights: np.ndarray  #: [N, K], rows sum to 1; some are negative for points outside the convex hull of the nodes
 
     def move(self, nodes: np.ndarray) -> np.ndarray:
         """Points [N, 3] for the positions ``nodes`` [..., 3]."""
@@ -30,15 +25,12 @@ class Binding:
 
 @dataclass(frozen=True)
 class ControlGrid:
-    """Control grid of a soft body.
+    """Control grid of a soft body."""
 
-    Attributes:
-        nodes: [T, c+1, c+1, c+1, 3], world coordinates in metres; frame 0 is an axis-aligned box of equal cells.
-        occupied: bool [c, c, c], cells with collision vertices whose corners all move with the body. Nodes of other
-            cells are not simulated.
-    """
-
+    #: [T, c+1, c+1, c+1, 3], world coordinates in metres; frame 0 is an axis-aligned box of equal cells
     nodes: np.ndarray
+    #: bool [c, c, c], cells with collision vertices whose corners all move with the body. Nodes of other cells are not
+    #: simulated.
     occupied: np.ndarray
 
     def bind(self, points: np.ndarray) -> Binding:
@@ -64,13 +56,9 @@ class ControlGrid:
 
 @dataclass(frozen=True)
 class RigidFrame:
-    """Axes of a rigid body.
+    """Axes of a rigid body."""
 
-    Attributes:
-        nodes: [T, 4, 3], origin and tips of the three unit axes, world coordinates in metres.
-    """
-
-    nodes: np.ndarray
+    nodes: np.ndarray  #: [T, 4, 3], origin and tips of the three unit axes, world coordinates in metres
 
     def bind(self, points: np.ndarray) -> Binding:
         """Binds ``points`` [N, 3] at frame 0 to the axes."""
@@ -82,13 +70,9 @@ class RigidFrame:
 
 @dataclass(frozen=True)
 class ClothGrid:
-    """Grid of a cloth.
+    """Grid of a cloth."""
 
-    Attributes:
-        nodes: square grid [T, n, n, 3], world coordinates in metres.
-    """
-
-    nodes: np.ndarray
+    nodes: np.ndarray  #: square grid [T, n, n, 3], world coordinates in metres
 
     def refine(self, times: int) -> Binding:
         """Binds a grid that is ``times`` finer, by Catmull-Rom interpolation along both axes; row-major points."""
@@ -125,13 +109,9 @@ def grid_faces(n: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class ParticleCloud:
-    """Particles of a body.
+    """Particles of a body."""
 
-    Attributes:
-        nodes: [T, P, 3], world coordinates in metres.
-    """
-
-    nodes: np.ndarray
+    nodes: np.ndarray  #: [T, P, 3], world coordinates in metres
 
     def bind(self, points: np.ndarray) -> Binding:
         """Binds ``points`` [N, 3] at frame 0 to their nearest particles.

@@ -38,23 +38,15 @@ SCRIPTED = 0.7  # fraction of scenes in which the body is taken and put down; in
 
 @dataclass(frozen=True)
 class CarryPolicy:
-    """A prescribed motion of two hands and the body between them.
+    """A prescribed motion of two hands and the body between them."""
 
-    Attributes:
-        poses: position of the body's center, rotation about z and tilt about the axis between the hands [T, 5].
-        apart: distance of each hand to the body [T] in metres.
-        curl: rad between two bones of a finger [T].
-        center: center of the body at time 0 [3] in metres.
-        axis: rad, direction from the left to the right hand at time 0.
-        half: half of the body's extent along it in metres.
-    """
-
+    #: position of the body's center, rotation about z and tilt about the axis between the hands [T, 5]
     poses: np.ndarray
-    apart: np.ndarray
-    curl: np.ndarray
-    center: np.ndarray
-    axis: float
-    half: float
+    apart: np.ndarray  #: distance of each hand to the body [T] in metres
+    curl: np.ndarray  #: rad between two bones of a finger [T]
+    center: np.ndarray  #: center of the body at time 0 [3] in metres
+    axis: float  #: rad, direction from the left to the right hand at time 0
+    half: float  #: half of the body's extent along it in metres
 
     def moved(self, points: np.ndarray) -> np.ndarray:
         """Positions [T, N, 3] of ``points`` [N, 3] that are fixed to the body."""

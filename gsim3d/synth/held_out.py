@@ -16,19 +16,12 @@ SETS = {"validation": (VALIDATION_SEED, 24), "test": (TEST_SEED, 56)}
 
 @dataclass(frozen=True)
 class Origin:
-    """Generator options of a scene.
+    """Generator options of a scene."""
 
-    Attributes:
-        world: a key of worlds.WORLDS.
-        subset: held-out variant of the world; None: the training variant.
-        seed: seed of the set.
-        body: name of the object.
-    """
-
-    world: str
-    subset: str | None
-    seed: int
-    body: str
+    world: str  #: a key of worlds.WORLDS
+    subset: str | None  #: held-out variant of the world; None: the training variant
+    seed: int  #: seed of the set
+    body: str  #: name of the object
 
     @property
     def set_name(self) -> str | None:

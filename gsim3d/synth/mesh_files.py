@@ -21,16 +21,11 @@ SLOTS = 3  # largest number of channels of a corner
 
 @dataclass(frozen=True)
 class Piece:
-    """Triangles of one material.
+    """Triangles of one material."""
 
-    Attributes:
-        triangles: positions [F, 3, 3].
-        corners: input of ``paint`` at the corners of each face [F, 3, C]; None: no colour.
-        paint: function [N, C] -> colours [N, 3] in [0, 1]; None: no colour.
-    """
-
-    triangles: np.ndarray
-    corners: np.ndarray | None = None
+    triangles: np.ndarray  #: positions [F, 3, 3]
+    corners: np.ndarray | None = None  #: input of ``paint`` at the corners of each face [F, 3, C]; None: no colour
+    #: function [N, C] -> colours [N, 3] in [0, 1]; None: no colour
     paint: Callable[[np.ndarray], np.ndarray] | None = None
 
 

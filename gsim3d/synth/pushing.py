@@ -61,13 +61,9 @@ def pusher_surface() -> tuple[render.Surface, np.ndarray]:
 
 @dataclass(frozen=True)
 class PushState:
-    """Full state of a :class:`PushSimulation`.
+    """Full state of a :class:`PushSimulation`."""
 
-    Attributes:
-        values: integration state of MuJoCo, float64.
-    """
-
-    values: np.ndarray
+    values: np.ndarray  #: integration state of MuJoCo, float64
 
 
 class PushSimulation:

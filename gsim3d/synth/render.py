@@ -26,52 +26,33 @@ GROUND_SECTORS = 12
 
 @dataclass(frozen=True)
 class View:
-    """Images of all cameras at one frame.
+    """Images of all cameras at one frame."""
 
-    Attributes:
-        rgb: uint8 [V, H, W, 3].
-        segmentation: uint8 [V, H, W]: BACKGROUND, GROUND or BODY.
-        instances: uint8 [V, H, W]: BACKGROUND, GROUND, or FIRST_BODY and more.
-        depth: float32 [V, H, W], mean depth along the optical axis in metres of the rays that hit the pixel's instance,
-            0 for the background; None: not rendered.
-    """
-
-    rgb: np.ndarray
-    segmentation: np.ndarray
-    instances: np.ndarray
+    rgb: np.ndarray  #: uint8 [V, H, W, 3]
+    segmentation: np.ndarray  #: uint8 [V, H, W]: BACKGROUND, GROUND or BODY
+    instances: np.ndarray  #: uint8 [V, H, W]: BACKGROUND, GROUND, or FIRST_BODY and more
+    #: float32 [V, H, W], mean depth along the optical axis in metres of the rays that hit the pixel's instance, 0 for
+    #: the background; None: not rendered
     depth: np.ndarray | None
 
 
 @dataclass(frozen=True)
 class Surface:
-    """A body to render.
+    """A body to render."""
 
-    Attributes:
-        faces: [F, 3].
-        corners: [F, 3, C], see :class:`gsim3d.synth.shapes.Body`.
-        paint: function [N, C] -> colours [N, 3].
-        two_sided: shades both sides, for sheets.
-    """
-
-    faces: np.ndarray
-    corners: np.ndarray
-    paint: Callable[[np.ndarray], np.ndarray]
-    two_sided: bool = False
+    faces: np.ndarray  #: [F, 3]
+    corners: np.ndarray  #: [F, 3, C], see :class:`gsim3d.synth.shapes.Body`
+    paint: Callable[[np.ndarray], np.ndarray]  #: function [N, C] -> colours [N, 3]
+    two_sided: bool = False  #: shades both sides, for sheets
 
 
 @dataclass(frozen=True)
 class Ground:
-    """A disc around the world's z axis.
+    """A disc around the world's z axis."""
 
-    Attributes:
-        radius: radius in metres.
-        height: height in metres.
-        albedo: uniform grey in [0, 1]; None: a pattern of rings and sectors in three colours.
-    """
-
-    radius: float
-    height: float
-    albedo: float | None = None
+    radius: float  #: radius in metres
+    height: float  #: height in metres
+    albedo: float | None = None  #: uniform grey in [0, 1]; None: a pattern of rings and sectors in three colours
 
 
 def ground_color(points: np.ndarray, radius: float) -> np.ndarray:

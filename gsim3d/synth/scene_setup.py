@@ -15,86 +15,50 @@ MAX_GAIN = 0.3  # gain of energy in J/kg, as of a fall of 3 cm; the error of cen
 
 @dataclass(frozen=True)
 class Material:
-    """Material of a soft body.
+    """Material of a soft body."""
 
-    Attributes:
-        young: Young's modulus in Pa.
-        damping: damping time in seconds.
-        yield_strain: strain at which plastic deformation begins; 0: purely elastic.
-    """
-
-    young: float
-    damping: float
-    yield_strain: float = 0.0
+    young: float  #: Young's modulus in Pa
+    damping: float  #: damping time in seconds
+    yield_strain: float = 0.0  #: strain at which plastic deformation begins; 0: purely elastic
 
 
 @dataclass(frozen=True)
 class SoftBody:
-    """A soft body.
+    """A soft body."""
 
-    Attributes:
-        vertices: collision mesh [V, 3], world coordinates in metres.
-        faces: collision mesh [F, 3].
-        velocity: [3] in m/s.
-        spin: [3] in rad/s about the center.
-        material: material of the body.
-        mass: mass in kg.
-        cells: cells of the control grid along each axis.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    velocity: np.ndarray
-    spin: np.ndarray
-    material: Material
-    mass: float
-    cells: int
+    vertices: np.ndarray  #: collision mesh [V, 3], world coordinates in metres
+    faces: np.ndarray  #: collision mesh [F, 3]
+    velocity: np.ndarray  #: [3] in m/s
+    spin: np.ndarray  #: [3] in rad/s about the center
+    material: Material  #: material of the body
+    mass: float  #: mass in kg
+    cells: int  #: cells of the control grid along each axis
 
 
 @dataclass(frozen=True)
 class RigidBody:
-    """A rigid body.
+    """A rigid body."""
 
-    Attributes:
-        parts: vertices [V, 3] of the convex pieces of the body, world coordinates in metres.
-        velocity: [3] in m/s.
-        spin: [3] in rad/s about the center.
-        mass: mass in kg.
-        friction: coefficient of sliding friction.
-        bounce: approximate coefficient of restitution in [0, 1].
-    """
-
-    parts: tuple[np.ndarray, ...]
-    velocity: np.ndarray
-    spin: np.ndarray
-    mass: float
-    friction: float
-    bounce: float
+    parts: tuple[np.ndarray, ...]  #: vertices [V, 3] of the convex pieces of the body, world coordinates in metres
+    velocity: np.ndarray  #: [3] in m/s
+    spin: np.ndarray  #: [3] in rad/s about the center
+    mass: float  #: mass in kg
+    friction: float  #: coefficient of sliding friction
+    bounce: float  #: approximate coefficient of restitution in [0, 1]
 
 
 @dataclass(frozen=True)
 class Cloth:
-    """A square cloth, flat at time 0, whose corners are fixed or which grippers hold.
+    """A square cloth, flat at time 0, whose corners are fixed or which grippers hold."""
 
-    Attributes:
-        width: width in metres.
-        height: height at time 0 in metres.
-        count: nodes along a side.
-        mass: mass in kg.
-        young: Young's modulus in Pa.
-        thickness: thickness in metres, for the stiffness.
-        damping: damping time in seconds.
-        held: indices of the nodes that grippers hold; None: the four corners are fixed.
-    """
-
-    width: float
-    height: float
-    count: int
-    mass: float
-    young: float
-    thickness: float
-    damping: float
-    held: tuple[int, ...] | None = None
+    width: float  #: width in metres
+    height: float  #: height at time 0 in metres
+    count: int  #: nodes along a side
+    mass: float  #: mass in kg
+    young: float  #: Young's modulus in Pa
+    thickness: float  #: thickness in metres, for the stiffness
+    damping: float  #: damping time in seconds
+    held: tuple[int, ...] | None = None  #: indices of the nodes that grippers hold; None: the four corners are fixed
 
     def rest_nodes(self) -> np.ndarray:
         """Nodes at time 0 [n, n, 3], world coordinates in metres."""
@@ -104,33 +68,21 @@ class Cloth:
 
 @dataclass(frozen=True)
 class Pusher:
-    """A kinematic sphere.
+    """A kinematic sphere."""
 
-    Attributes:
-        position: center at time 0 [3] in metres.
-        radius: radius in metres.
-    """
-
-    position: np.ndarray
-    radius: float
+    position: np.ndarray  #: center at time 0 [3] in metres
+    radius: float  #: radius in metres
 
 
 @dataclass(frozen=True)
 class SceneSetup:
-    """A scene at time 0.
+    """A scene at time 0."""
 
-    Attributes:
-        bodies: soft or rigid bodies.
-        ground: height of the ground in metres; None: no ground.
-        cloth: cloth; None: no cloth.
-        pusher: kinematic sphere; None: no sphere.
-        grips: positions of the grippers of the cloth at every frame [T, G, 3] in metres; None: no grippers.
-    """
-
-    bodies: tuple[SoftBody | RigidBody, ...]
-    ground: float | None
-    cloth: Cloth | None = None
-    pusher: Pusher | None = None
+    bodies: tuple[SoftBody | RigidBody, ...]  #: soft or rigid bodies
+    ground: float | None  #: height of the ground in metres; None: no ground
+    cloth: Cloth | None = None  #: cloth; None: no cloth
+    pusher: Pusher | None = None  #: kinematic sphere; None: no sphere
+    #: positions of the grippers of the cloth at every frame [T, G, 3] in metres; None: no grippers
     grips: np.ndarray | None = None
 
 

@@ -26,25 +26,15 @@ PALETTE = np.array(
 
 @dataclass(frozen=True)
 class Body:
-    """A rendered mesh, a collision mesh, and the colour of every surface point.
+    """A rendered mesh, a collision mesh, and the colour of every surface point."""
 
-    Attributes:
-        name: name of the shape or file.
-        vertices: rendered mesh [V, 3].
-        faces: rendered mesh, int [F, 3].
-        collision_vertices: collision mesh [V', 3].
-        collision_faces: collision mesh, int [F', 3].
-        corners: input of ``paint`` at the corners of each face [F, 3, C]: texture or rest coordinates.
-        paint: function [N, C] -> colours [N, 3] in [0, 1].
-    """
-
-    name: str
-    vertices: np.ndarray
-    faces: np.ndarray
-    collision_vertices: np.ndarray
-    collision_faces: np.ndarray
-    corners: np.ndarray
-    paint: Callable[[np.ndarray], np.ndarray]
+    name: str  #: name of the shape or file
+    vertices: np.ndarray  #: rendered mesh [V, 3]
+    faces: np.ndarray  #: rendered mesh, int [F, 3]
+    collision_vertices: np.ndarray  #: collision mesh [V', 3]
+    collision_faces: np.ndarray  #: collision mesh, int [F', 3]
+    corners: np.ndarray  #: input of ``paint`` at the corners of each face [F, 3, C]: texture or rest coordinates
+    paint: Callable[[np.ndarray], np.ndarray]  #: function [N, C] -> colours [N, 3] in [0, 1]
 
 
 def icosphere(level: int) -> tuple[np.ndarray, np.ndarray]:

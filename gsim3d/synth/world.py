@@ -40,38 +40,23 @@ class Rejected(Exception):
 
 @dataclass(frozen=True)
 class SceneBody:
-    """A body of a scene.
+    """A body of a scene."""
 
-    Attributes:
-        body: simulated body.
-        surface: rendered surface.
-        vertices: vertices of the surface at time 0 [V, 3] in metres.
-        facts: entry of metadata.json.
-    """
-
-    body: SoftBody | RigidBody
-    surface: render.Surface
-    vertices: np.ndarray
-    facts: dict
+    body: SoftBody | RigidBody  #: simulated body
+    surface: render.Surface  #: rendered surface
+    vertices: np.ndarray  #: vertices of the surface at time 0 [V, 3] in metres
+    facts: dict  #: entry of metadata.json
 
 
 @dataclass(frozen=True)
 class SceneDraw:
-    """A random draw of a scene at time 0.
+    """A random draw of a scene at time 0."""
 
-    Attributes:
-        ground: height of the ground in metres; None: no ground.
-        cloth: cloth; None: no cloth.
-        bodies: bodies.
-        surfaces: surfaces of the bodies, then of the cloth, then of the actors.
-        policy: how the actors move; None: no actors.
-    """
-
-    ground: float | None
-    cloth: Cloth | None
-    bodies: list[SceneBody]
-    surfaces: list[render.Surface]
-    policy: Any = None
+    ground: float | None  #: height of the ground in metres; None: no ground
+    cloth: Cloth | None  #: cloth; None: no cloth
+    bodies: list[SceneBody]  #: bodies
+    surfaces: list[render.Surface]  #: surfaces of the bodies, then of the cloth, then of the actors
+    policy: Any = None  #: how the actors move; None: no actors
 
 
 @dataclass(frozen=True)

@@ -35,31 +35,18 @@ PACKAGES = ("numpy", "mujoco-core", "embreex", "trimesh", "opencv-contrib-python
 
 @dataclass(frozen=True)
 class Scene:
-    """A rendered trajectory.
+    """A rendered trajectory."""
 
-    Attributes:
-        object: name of the first body.
-        sample: index of the trajectory of this object.
-        fps: frames a second.
-        rig: cameras.
-        views: images of every frame.
-        states: name of a body or "cloth" -> nodes of its embedding, float32 [T, ..., 3] in metres.
-        extras: additional keys of metadata.json.
-        fingerprint: hash of the options that the scene depends on.
-        actions: positions of the actors' points, float32 [T, A, 3] in metres; None: no actors.
-        action_types: type of each point.
-    """
-
-    object: str
-    sample: int
-    fps: float
-    rig: Rig
-    views: list[View]
-    states: dict[str, np.ndarray]
-    extras: dict
-    fingerprint: str
-    actions: np.ndarray | None = None
-    action_types: tuple[str, ...] = ()
+    object: str  #: name of the first body
+    sample: int  #: index of the trajectory of this object
+    fps: float  #: frames a second
+    rig: Rig  #: cameras
+    views: list[View]  #: images of every frame
+    states: dict[str, np.ndarray]  #: name of a body or "cloth" -> nodes of its embedding, float32 [T, ..., 3] in metres
+    extras: dict  #: additional keys of metadata.json
+    fingerprint: str  #: hash of the options that the scene depends on
+    actions: np.ndarray | None = None  #: positions of the actors' points, float32 [T, A, 3] in metres; None: no actors
+    action_types: tuple[str, ...] = ()  #: type of each point
 
 
 def scene_folder(out: Path, name: str, sample: int) -> Path:

@@ -43,42 +43,25 @@ RANDOM_SIZE = 32  # width and height of random images
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of a check.
+    """Result of a check."""
 
-    Attributes:
-        check: name of the check.
-        outcome: "holds", "fails", "known failure" (listed in the model card) or "not promised".
-        n_compared: number of compared tensors.
-        seconds: duration of the check.
-        worst: deviation with the largest error relative to its bound.
-        failures: deviations above their bounds.
-        file: file that reproduces the failures.
-        reason: why the check is not promised, or the entry of the model card.
-    """
-
-    check: str
-    outcome: str
-    n_compared: int = 0
-    seconds: float = 0.0
-    worst: Deviation | None = None
-    failures: tuple[Deviation, ...] = ()
-    file: str | None = None
-    reason: str | None = None
+    check: str  #: name of the check
+    outcome: str  #: "holds", "fails", "known failure" (listed in the model card) or "not promised"
+    n_compared: int = 0  #: number of compared tensors
+    seconds: float = 0.0  #: duration of the check
+    worst: Deviation | None = None  #: deviation with the largest error relative to its bound
+    failures: tuple[Deviation, ...] = ()  #: deviations above their bounds
+    file: str | None = None  #: file that reproduces the failures
+    reason: str | None = None  #: why the check is not promised, or the entry of the model card
 
 
 @dataclass(frozen=True)
 class Report:
-    """Results of all checks.
+    """Results of all checks."""
 
-    Attributes:
-        subject: description of the model and its inputs.
-        problems: problems of scenes that could not be read.
-        findings: one finding for each check.
-    """
-
-    subject: dict[str, str]
-    problems: tuple[str, ...] = ()
-    findings: tuple[Finding, ...] = ()
+    subject: dict[str, str]  #: description of the model and its inputs
+    problems: tuple[str, ...] = ()  #: problems of scenes that could not be read
+    findings: tuple[Finding, ...] = ()  #: one finding for each check
 
     @property
     def healthy(self) -> bool:
@@ -87,19 +70,12 @@ class Report:
 
 @dataclass(frozen=True)
 class Subject:
-    """A simulator to check.
+    """A simulator to check."""
 
-    Attributes:
-        simulator: the simulator.
-        origin: its checkpoint or preset.
-        restored: restored checkpoint; None: random weights.
-        known: check -> failure listed in the model card.
-    """
-
-    simulator: Simulator
-    origin: dict[str, str]
-    restored: Restored | None = None
-    known: dict[str, dict] = dataclasses.field(default_factory=dict)
+    simulator: Simulator  #: the simulator
+    origin: dict[str, str]  #: its checkpoint or preset
+    restored: Restored | None = None  #: restored checkpoint; None: random weights
+    known: dict[str, dict] = dataclasses.field(default_factory=dict)  #: check -> failure listed in the model card
 
     def sample(self, frames: Frames, targets: Cameras, n_steps: int = SHORT) -> Sample:
         """A sample on the simulator's device, with the plan of its training."""

@@ -34,21 +34,13 @@ GRADIENT_STEPS = 12
 
 @dataclass(frozen=True)
 class Curves:
-    """Statistics of each step over all scenes.
+    """Statistics of each step over all scenes."""
 
-    Attributes:
-        kinetic_energy: in (m/step)^2, for unit masses.
-        opacity_mass: sum of opacities.
-        extent: diagonal of the bounding box of the largest scene in metres.
-        speed: largest displacement of a particle in m/step.
-        awake: number of awake particles.
-    """
-
-    kinetic_energy: list[float]
-    opacity_mass: list[float]
-    extent: list[float]
-    speed: list[float]
-    awake: list[int]
+    kinetic_energy: list[float]  #: in (m/step)^2, for unit masses
+    opacity_mass: list[float]  #: sum of opacities
+    extent: list[float]  #: diagonal of the bounding box of the largest scene in metres
+    speed: list[float]  #: largest displacement of a particle in m/step
+    awake: list[int]  #: number of awake particles
 
 
 def rollout_curves(

@@ -46,34 +46,22 @@ MOST_KINDS = 4  # graphs kept at a time
 
 @dataclass(frozen=True)
 class Gradients:
-    """Result of a call of :class:`CapturedLoss`.
+    """Result of a call of :class:`CapturedLoss`."""
 
-    Attributes:
-        loss: scalar.
-        errors: [S], mean squared error of each step.
-        parameters: gradient of each of ``CapturedLoss.parameters``; None if the loss does not depend on it.
-    """
-
-    loss: Tensor
-    errors: Tensor
+    loss: Tensor  #: scalar
+    errors: Tensor  #: [S], mean squared error of each step
+    #: gradient of each of ``CapturedLoss.parameters``; None if the loss does not depend on it
     parameters: tuple[Tensor | None, ...]
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """A batch with the sizes that the host needs to run its graph.
+    """A batch with the sizes that the host needs to run its graph."""
 
-    Attributes:
-        batch: the batch.
-        counts: number of particles of each cloud.
-        moving: largest number of movable particles of a cloud.
-        shapes: static shapes of the encoder.
-    """
-
-    batch: Batch
-    counts: tuple[int, ...]
-    moving: int
-    shapes: StaticShapes
+    batch: Batch  #: the batch
+    counts: tuple[int, ...]  #: number of particles of each cloud
+    moving: int  #: largest number of movable particles of a cloud
+    shapes: StaticShapes  #: static shapes of the encoder
 
     @property
     def kind(self) -> tuple:

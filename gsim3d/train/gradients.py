@@ -70,21 +70,13 @@ def _unchanged_buffers(module: nn.Module) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Seen:
-    """Statistics of one call of the loss, as plain values.
+    """Statistics of one call of the loss, as plain values."""
 
-    Attributes:
-        n_particles: number of encoded particles.
-        n_clouds: number of encoded clouds.
-        n_unusable: number of findings in the report.
-        norms: gradient norm with respect to each simulated step.
-        error: message of an invalid number; None if all are valid.
-    """
-
-    n_particles: int = 0
-    n_clouds: int = 0
-    n_unusable: int = 0
-    norms: tuple[float, ...] = ()
-    error: str | None = None
+    n_particles: int = 0  #: number of encoded particles
+    n_clouds: int = 0  #: number of encoded clouds
+    n_unusable: int = 0  #: number of findings in the report
+    norms: tuple[float, ...] = ()  #: gradient norm with respect to each simulated step
+    error: str | None = None  #: message of an invalid number; None if all are valid
 
 
 class StepWatch:

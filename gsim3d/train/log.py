@@ -181,21 +181,13 @@ class Board:
 
 @dataclass(frozen=True)
 class Sample:
-    """A prediction of the first window of a scene.
+    """A prediction of the first window of a scene."""
 
-    Attributes:
-        particles: one cloud per step.
-        gaussians: decoded Gaussians.
-        n_given: number of encoded steps.
-        scene: the scene.
-        cam: camera of the sample video.
-    """
-
-    particles: Particles
-    gaussians: Gaussians
-    n_given: int
-    scene: Scene
-    cam: int
+    particles: Particles  #: one cloud per step
+    gaussians: Gaussians  #: decoded Gaussians
+    n_given: int  #: number of encoded steps
+    scene: Scene  #: the scene
+    cam: int  #: camera of the sample video
 
 
 @torch.no_grad()

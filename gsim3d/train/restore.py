@@ -31,19 +31,12 @@ PRESETS = ("tiny", "small", "paper_latent", "paper_explicit")
 
 @dataclass(frozen=True)
 class Restored:
-    """A trained simulator with its training settings.
+    """A trained simulator with its training settings."""
 
-    Attributes:
-        simulator: the simulator in evaluation mode.
-        data: data settings of the training.
-        plan: plan of the effects that it was trained with.
-        checkpoint: its checkpoint.
-    """
-
-    simulator: Simulator
-    data: DataConfig
-    plan: Plan
-    checkpoint: Checkpoint
+    simulator: Simulator  #: the simulator in evaluation mode
+    data: DataConfig  #: data settings of the training
+    plan: Plan  #: plan of the effects that it was trained with
+    checkpoint: Checkpoint  #: its checkpoint
 
     @property
     def image_size(self) -> tuple[int, int]:

@@ -27,23 +27,14 @@ READERS = 2  # threads that read batches, and number of batches read ahead
 
 @dataclass(frozen=True)
 class Batch:
-    """Windows of B scenes, each of n_context + n_future steps.
+    """Windows of B scenes, each of n_context + n_future steps."""
 
-    Attributes:
-        context: input images of the first n_context steps of each window.
-        targets: target images of all steps; image i shows cloud b * (n_context + n_future) + t.
-        n_context: number of encoded steps.
-        n_future: number of simulated steps.
-        cut: see :class:`gsim3d.train.config.PhaseConfig`.
-        noise: result of :func:`draw_noise`.
-    """
-
-    context: Frames
-    targets: Frames
-    n_context: int
-    n_future: int
-    cut: int = 0
-    noise: Tensor | None = None
+    context: Frames  #: input images of the first n_context steps of each window
+    targets: Frames  #: target images of all steps; image i shows cloud b * (n_context + n_future) + t
+    n_context: int  #: number of encoded steps
+    n_future: int  #: number of simulated steps
+    cut: int = 0  #: see :class:`gsim3d.train.config.PhaseConfig`
+    noise: Tensor | None = None  #: result of :func:`draw_noise`
 
     def to(self, device: str | torch.device) -> Batch:
         noise = None if self.noise is None else self.noise.to(device)

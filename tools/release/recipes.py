@@ -19,27 +19,16 @@ SEED = 20261126  # of the training stream; `gsim3d generate` without --seed make
 
 @dataclass(frozen=True)
 class Recipe:
-    """How one simulator is trained.
+    """How one simulator is trained."""
 
-    Attributes:
-        name: of the files of its runs.
-        world: `gsim3d generate WORLD --preset PRESET`.
-        train: configuration of one process; several processes draw a batch of that size each.
-        preset: of the world.
-        options: of the world, where they differ from the preset.
-        capacity: trajectories in device memory at a time; the newest replace the oldest.
-        n_first: trajectories that must be there before training begins.
-        n_validation: trajectories that are predicted and scored.
-    """
-
-    name: str
-    world: str
-    train: TrainConfig
-    preset: str = "published"
-    options: dict[str, Any] = field(default_factory=dict)
-    capacity: int = 240
-    n_first: int = 24
-    n_validation: int = 24
+    name: str  #: of the files of its runs
+    world: str  #: `gsim3d generate WORLD --preset PRESET`
+    train: TrainConfig  #: configuration of one process; several processes draw a batch of that size each
+    preset: str = "published"  #: of the world
+    options: dict[str, Any] = field(default_factory=dict)  #: of the world, where they differ from the preset
+    capacity: int = 240  #: trajectories in device memory at a time; the newest replace the oldest
+    n_first: int = 24  #: trajectories that must be there before training begins
+    n_validation: int = 24  #: trajectories that are predicted and scored
 
     def stream(self) -> World:
         """The world whose trajectories are trained on, without end."""

@@ -34,29 +34,19 @@ CURVE = ("step", "windows", "seconds", "loss", "past_psnr", "future_psnr", "lear
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a run has come.
+    """How far a run has come."""
 
-    Attributes:
-        step: optimizer steps.
-        windows: training windows with simulated steps.
-        seconds: of training, without filming and scoring.
-        next_trajectory: number of the first trajectory that was not handed out.
-        n_skipped: steps that changed nothing.
-        needed: capacity of CUDA graphs, of CapturedLoss.
-        runs: one entry a run: device, commit, seconds, steps, trajectories.
-        scores: validation scores on the way, one entry a checkpoint that was scored.
-        curve: rows of CURVE, one a logged step.
-    """
-
-    step: int = 0
-    windows: int = 0
-    seconds: float = 0.0
-    next_trajectory: int = 0
-    n_skipped: int = 0
-    needed: dict[str, Any] = field(default_factory=dict)
+    step: int = 0  #: optimizer steps
+    windows: int = 0  #: training windows with simulated steps
+    seconds: float = 0.0  #: of training, without filming and scoring
+    next_trajectory: int = 0  #: number of the first trajectory that was not handed out
+    n_skipped: int = 0  #: steps that changed nothing
+    needed: dict[str, Any] = field(default_factory=dict)  #: capacity of CUDA graphs, of CapturedLoss
+    #: one entry a run: device, commit, seconds, steps, trajectories
     runs: list[dict[str, Any]] = field(default_factory=list)
+    #: validation scores on the way, one entry a checkpoint that was scored
     scores: list[dict[str, Any]] = field(default_factory=list)
-    curve: list[list[float]] = field(default_factory=list)
+    curve: list[list[float]] = field(default_factory=list)  #: rows of CURVE, one a logged step
 
 
 def state_file(folder: str | Path, name: str) -> Path:

@@ -33,27 +33,16 @@ QUEUED = 2  # trajectories that wait for each data worker
 
 @dataclass(frozen=True)
 class Trajectory:
-    """One trajectory of a store, as far as the drawing of windows reads it.
+    """One trajectory of a store, as far as the drawing of windows reads it."""
 
-    Attributes:
-        slot: its number in the store.
-        path: a name.
-        n_steps: frames of each camera.
-        n_cams: cameras.
-        width: pixels.
-        height: pixels.
-        fps: frames per second.
-        acting: whether it has actors.
-    """
-
-    slot: int
-    path: Path
-    n_steps: int
-    n_cams: int
-    width: int
-    height: int
-    fps: float
-    acting: bool = False
+    slot: int  #: its number in the store
+    path: Path  #: a name
+    n_steps: int  #: frames of each camera
+    n_cams: int  #: cameras
+    width: int  #: pixels
+    height: int  #: pixels
+    fps: float  #: frames per second
+    acting: bool = False  #: whether it has actors
 
     @property
     def name(self) -> str:

