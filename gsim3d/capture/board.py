@@ -6,6 +6,7 @@ Pixel centres are OpenCV's (integers). The board's axes are OpenCV's too: x alon
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 
 from gsim3d.capture.films import Film
@@ -33,8 +34,6 @@ class Board:
 
     def made(self):
         """Returns the board as an object of OpenCV; raises InputError if its measures are invalid."""
-        import cv2
-
         known = [name.removeprefix("DICT_") for name in dir(cv2.aruco) if name.startswith("DICT_")]
         if self.dictionary not in known:
             raise InputError(
@@ -102,8 +101,6 @@ def calibrate_board(films: Sequence[Film], offsets: Sequence[float], board: Boar
 
 def _detect(films: Sequence[Film], offsets: Sequence[float], board: Board) -> list[dict[int, tuple]]:
     """Returns (object points, pixels) of the board by time, for each camera."""
-    import cv2
-
     made = board.made()
     detector = cv2.aruco.CharucoDetector(made)
     spans = [film.video.times[[0, -1]] + offset for film, offset in zip(films, offsets, strict=True)]
@@ -124,8 +121,6 @@ def _detect(films: Sequence[Film], offsets: Sequence[float], board: Board) -> li
 
 
 def _intrinsics(film: Film, found: dict[int, tuple]) -> _Views:
-    import cv2
-
     if len(found) < MIN_VIEWS:
         raise InputError(
             f"camera {film.name}: the board is recognised in {len(found)} images; at least {MIN_VIEWS} are needed, "
@@ -200,8 +195,6 @@ def _lens(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _linearised(x, views, where):
     """Returns cost, normal matrix and slope of the robust squared errors, and the residuals of each camera."""
-    import cv2
-
     normal, slope, cost, residuals = np.zeros((len(x), len(x))), np.zeros(len(x)), 0.0, []
     for cam, own in enumerate(views):
         residuals.append([])
@@ -227,14 +220,10 @@ def _linearised(x, views, where):
 
 
 def _matrix(turn, shift) -> np.ndarray:
-    import cv2
-
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(np.asarray(turn))[0], np.ravel(shift)
     return pose
 
 
 def _vector(pose: np.ndarray) -> np.ndarray:
-    import cv2
-
     return np.concatenate([cv2.Rodrigues(pose[:3, :3])[0].ravel(), pose[:3, 3]])

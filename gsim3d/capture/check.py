@@ -1,5 +1,6 @@
 """Whether a capture can be learned from: angles between its cameras, and the fit of their calibration."""
 
+import cv2
 import numpy as np
 
 from gsim3d.capture.calibrate import MAX_ERROR
@@ -49,8 +50,6 @@ def match_errors(scene: Scene, found: np.ndarray) -> dict[str, tuple[float, int]
         "camera-camera" -> median reprojection error in pixels and number of matches; only pairs within MAX_ANGLE that
         share MIN_MATCHES or more.
     """
-    import cv2
-
     sift, features = cv2.SIFT_create(2000), []
     for cam in range(scene.n_cams):
         image = scene.recorded_images([cam], [0])[0, 0].permute(1, 2, 0).numpy()

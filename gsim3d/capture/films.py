@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from gsim3d.data.recording import Problems, natural_order
@@ -36,8 +37,6 @@ class Film:
     @classmethod
     def open(cls, file: Path) -> Film:
         """Opens a film; raises InputError if it cannot be decoded."""
-        import cv2
-
         capture = cv2.VideoCapture(opencv_path(file), cv2.CAP_FFMPEG)
         size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
         capture.release()
@@ -45,8 +44,6 @@ class Film:
 
     def grey(self, numbers: Sequence[int]):
         """Yields the frames of ascending ``numbers``, uint8 [h, w]."""
-        import cv2
-
         for image in self.video.read(numbers, Problems()):
             yield cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
 
@@ -91,8 +88,6 @@ def motion(film: Film) -> np.ndarray:
 
     Where a frame was dropped and the one before is shown again, the motion of the next one is spread over both.
     """
-    import cv2
-
     width, height = film.size
     small = MOTION_WIDTH, max(1, round(height * MOTION_WIDTH / width))
     before, found = None, []

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from gsim3d.capture.check import angles
@@ -171,8 +172,6 @@ def write_scene(take: Scene, proposal: Proposal, steps: Sequence[int], folder: P
         steps: consecutive steps.
         folder: scene folder; it appears complete.
     """
-    import cv2
-
     unfinished = folder.with_name(f".{folder.name}")
     shutil.rmtree(unfinished, ignore_errors=True)
     viewmats, Ks = take.recording.cameras_at_step(0)
@@ -209,8 +208,6 @@ def write_scene(take: Scene, proposal: Proposal, steps: Sequence[int], folder: P
 
 def _cropped(image: np.ndarray, crop: tuple[int, int, int, int]) -> np.ndarray:
     """Returns the crop of an image, black outside."""
-    import cv2
-
     left, top, width, height = crop
     over = [max(0, -top), max(0, top + height - image.shape[0]), max(0, -left), max(0, left + width - image.shape[1])]
     padded = cv2.copyMakeBorder(image, *over, cv2.BORDER_CONSTANT, value=0)

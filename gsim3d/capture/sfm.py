@@ -4,6 +4,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from gsim3d.capture.board import Calibrated
@@ -31,8 +32,6 @@ def calibrate_sfm(films: Sequence[Film]) -> list[Calibrated]:
         raise InputError(
             "calibration without a board needs pycolmap: pip install 'gsim3d[capture]' (or film a board: --board)"
         ) from error
-    import cv2
-
     with tempfile.TemporaryDirectory() as temporary:
         images, database = Path(temporary) / "images", Path(temporary) / "features.db"
         images.mkdir()

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from gsim3d.data import layouts
@@ -108,8 +109,6 @@ def moving_box(scene: Scene, step: int) -> tuple[np.ndarray | None, int]:
 
 def _common_box(scene: Scene, step: int, labels: np.ndarray, seeing: np.ndarray, box: np.ndarray) -> np.ndarray | None:
     """Returns the bounding box of the grid points in ``box`` inside the moving masks of the cameras ``seeing``."""
-    import cv2
-
     recording = scene.recording
     viewmats, Ks = recording.cameras_at_step(step)
     cell = (box[1] - box[0]) / (HULL_GRID - 1)
@@ -193,8 +192,6 @@ def _try(compute):
 
 
 def _tile(scene: Scene, cam: int, step: int, tile_height: int, body: np.ndarray | None) -> np.ndarray:
-    import cv2
-
     width, height = scene.recording.sizes[cam]
     zoom = tile_height / height
     size = max(1, round(width * zoom)), tile_height
@@ -219,8 +216,6 @@ def _tile(scene: Scene, cam: int, step: int, tile_height: int, body: np.ndarray 
 
 
 def _draw_scene(tile: np.ndarray, scene: Scene, cam: int, step: int, zoom: float, body: np.ndarray | None) -> None:
-    import cv2
-
     viewmats, Ks = scene.recording.cameras_at_step(step)
     viewmat, K = viewmats[cam], np.diag([zoom, zoom, 1.0]) @ Ks[cam]
 
@@ -258,14 +253,10 @@ def _draw_scene(tile: np.ndarray, scene: Scene, cam: int, step: int, zoom: float
 
 
 def _write(image: np.ndarray, text: str, corner: Sequence[int], color: tuple) -> None:
-    import cv2
-
     cv2.putText(image, plain(text), tuple(corner), cv2.FONT_HERSHEY_SIMPLEX, TEXT, color, 1, cv2.LINE_AA)
 
 
 def _text(text: str) -> np.ndarray:
-    import cv2
-
     (width, _), _ = cv2.getTextSize(plain(text), cv2.FONT_HERSHEY_SIMPLEX, TEXT, 1)
     line = np.full((LINE, width + 8, 3), PAPER, np.uint8)
     _write(line, text, (4, LINE - 7), INK)

@@ -8,6 +8,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from gsim3d.data.headers import Header, read_header
@@ -35,8 +36,6 @@ def read_image(file: Path, size: tuple[int, int], frame: str, problems: Problems
     Returns:
         uint8 or uint16, [h, w] or [h, w, 3 or 4] (BGR or BGRA); None on error.
     """
-    import cv2
-
     what = f"image {file} ({frame})"
     data = _bytes_of(file, what, problems)
     if data is None:
@@ -175,8 +174,6 @@ def _marked(grey: np.ndarray, lossy: bool) -> np.ndarray | None:
 
 def _are_labels(grey: np.ndarray, levels: np.ndarray) -> bool:
     """Returns whether most intermediate values form flat regions, unlike noise and soft borders."""
-    import cv2
-
     inner = levels[1:-1]
     if not 0 < len(inner) <= MAX_LABELS:
         return False
@@ -187,8 +184,6 @@ def _are_labels(grey: np.ndarray, levels: np.ndarray) -> bool:
 
 def _blocks(where: np.ndarray) -> np.ndarray:
     """Erodes bool [h, w] by a 5x5 block."""
-    import cv2
-
     block = np.ones((5, 5), np.uint8)  # wider than soft borders of JPEG chroma at half resolution
     return cv2.erode(where.astype(np.uint8), block, borderType=cv2.BORDER_REPLICATE) > 0
 

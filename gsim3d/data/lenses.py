@@ -3,6 +3,7 @@
 import re
 from collections.abc import Mapping
 
+import cv2
 import numpy as np
 
 from gsim3d.data.recording import Lens, Problems, array
@@ -110,8 +111,6 @@ class Undistorter:
         self._key, self._maps = None, None
 
     def __call__(self, image: np.ndarray, K: np.ndarray, *, nearest: bool = False) -> np.ndarray:
-        import cv2
-
         x, y = self._sources(K)
         return cv2.remap(image, x, y, cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR, borderValue=0)
 
@@ -122,8 +121,6 @@ class Undistorter:
 
     def _sources(self, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns the source coordinates x and y of each pixel, float32 [h, w]; cached for equal K."""
-        import cv2
-
         if self._key is None or not np.array_equal(self._key, K):
             centred = K.copy()
             centred[:2, 2] -= 0.5  # OpenCV's pixel centres are integers

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
+import cv2
 import numpy as np
 
 from gsim3d.data.recording import evenly_spaced
@@ -34,8 +35,6 @@ def background_image(read: Callable[[Sequence[int]], np.ndarray], n_steps: int) 
         read: function steps -> uint8 [S, h, w, 3].
         n_steps: number of steps recorded.
     """
-    import cv2
-
     frames = read(evenly_spaced(n_steps, BACKGROUND_STEPS))
     n, shape = len(frames), frames.shape[1:3]
     blocks = [_frequent(rows.reshape(n, -1, 3)) for rows in np.split(frames, range(ROWS, shape[0], ROWS), axis=1)]
@@ -83,8 +82,6 @@ def _difference(frames: np.ndarray, color: np.ndarray) -> np.ndarray:
 
 def foreground(image: np.ndarray, background: np.ndarray) -> np.ndarray:
     """Returns bool [h, w]: pixels that differ from ``background`` by more than noise, cleaned by morphology."""
-    import cv2
-
     smooth = [cv2.GaussianBlur(picture, (0, 0), BLUR).astype(np.float32) for picture in (image, background)]
     difference = np.abs(smooth[0] - smooth[1]).max(-1)
     # Most of the image is background, so the median difference is a robust estimate of the noise.
@@ -99,8 +96,6 @@ def foreground(image: np.ndarray, background: np.ndarray) -> np.ndarray:
 
 def _large(mask: np.ndarray, least: float) -> np.ndarray:
     """Returns bool [h, w]: the connected components of ``mask`` with at least the fraction ``least`` of the image."""
-    import cv2
-
     _, parts, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
     large = stats[:, cv2.CC_STAT_AREA] >= least * mask.size
     large[0] = False

@@ -8,6 +8,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import BinaryIO
 
+import cv2
 import numpy as np
 
 from gsim3d.data.recording import MAX_STEPS, Problems
@@ -55,8 +56,6 @@ class Video:
 
     def read(self, numbers: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:
         """Yields the frames of ascending ``numbers`` (may repeat), uint8 RGB [h, w, 3]; None on error."""
-        import cv2
-
         capture = _open(self._file, self.what + " ")
         try:
             at, ended = -1, False
@@ -94,8 +93,6 @@ def _scan(file: Path, size: tuple[int, int], stamp: tuple) -> _Scan:
     Raises:
         InputError: the file is invalid; the message does not include its name.
     """
-    import cv2
-
     index = _index(file)
     capture = _open(file)
     try:
@@ -135,8 +132,6 @@ def _scan(file: Path, size: tuple[int, int], stamp: tuple) -> _Scan:
 
 
 def _open(file: Path, what: str = ""):
-    import cv2
-
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # errors are reported here, with their file and camera
     capture = cv2.VideoCapture(opencv_path(file), cv2.CAP_FFMPEG)
     if not capture.isOpened():

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -74,8 +75,6 @@ def ring_around_bodies(labels: Tensor) -> Tensor:
     Returns:
         bool [..., H, W], on the device of ``labels``.
     """
-    import cv2
-
     images = labels.cpu().numpy().reshape(-1, *labels.shape[-2:])
     ring = np.zeros(images.shape, bool)
     for image, near in zip(images, ring):

@@ -12,6 +12,7 @@ import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from gsim3d.errors import InputError
@@ -151,7 +152,6 @@ def _scene_errors(world: World, scene: tuple[str, int], folder: Path, out: Path 
 
 def _truth(world: World, folder: Path) -> tuple[np.ndarray, np.ndarray]:
     """Images uint8 [T, V, H, W, 3] and masks bool [2, T, V, H, W] of the steps after the input."""
-    import cv2
 
     def read(kind: str, flag: int) -> np.ndarray:
         steps = []

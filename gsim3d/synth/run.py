@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from gsim3d.effects.spec import FILE as EFFECTS_FILE
@@ -158,8 +159,6 @@ def _make_one(settings, out: Path, scene: tuple[str, int]) -> None:
 
 def start_worker() -> None:
     """Initializes a worker process."""
-    import cv2
-
     cv2.setNumThreads(1)
     # Exit with the parent; else a worker of a killed parent would wait forever.
     parent = multiprocessing.parent_process()

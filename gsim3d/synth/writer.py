@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from gsim3d.errors import InputError
@@ -109,8 +110,6 @@ def _images(view: View) -> list[tuple[str, np.ndarray]]:
 
 
 def _png(image: np.ndarray) -> bytes:
-    import cv2
-
     done, data = cv2.imencode(".png", np.ascontiguousarray(image), [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION])
     if not done:
         raise RuntimeError("OpenCV could not encode a PNG")
