@@ -212,15 +212,12 @@ class Fit:
                 bar.update()
 
     def _pass(self, count, share, adam, schedule, *, damping: float, soft: bool = True, moved: bool = False) -> float:
-        """Returns the mean loss of frames 1 to ``count - 1``, with a step of Adam each; gradients end at the frame.
-
-        The velocity at frame 0 is added to the state of each frame, and taken off after it, so that all frames see it.
-        """
+        """Returns the mean loss of frames 1 to ``count - 1``, with a step of Adam each; gradients end at the frame."""
         state, total = SpringState(self.springs.rest, torch.zeros_like(self.springs.rest)), 0.0
         parameters = [p for group in adam.param_groups for p in group["params"]]
         for frame in range(1, count):
             state = self._advance(frame, state, damping, soft)
-            means = self._means(state.positions, moved)
+            means = self._bound(state.positions) + (self._offset if moved else 0)  # moved from where they began
             loss = self._loss(frame, means, share)
             adam.zero_grad()
             loss.backward()
@@ -241,10 +238,6 @@ class Fit:
             frame, self.substeps, self.config.more_substeps, state=started, springs=self.springs, **given
         )
         return SpringState(ended.positions, ended.velocities - self.velocity)
-
-    def _means(self, anchors: Tensor, moved: bool) -> Tensor:
-        """Positions of the Gaussians: means of anchors, or where they began ``moved`` by what the anchors did."""
-        return self._bound(anchors) + (self._offset if moved else 0)
 
     @torch.no_grad()
     def images(self, cams: Sequence[int], steps: range) -> Tensor:
@@ -295,10 +288,7 @@ def _step(adam: torch.optim.Adam, loss: Tensor) -> None:
 
 
 def _hull(scene: Scene, cams: Sequence[int], count: int) -> tuple[list[Tensor], Tensor]:
-    """Centres of voxels along each axis, and which lie inside of all masks of frame 0, bool [X, Y, Z].
-
-    There are ``count`` voxels along the longest side of the scene, or, unless that is COARSE, of the object's box.
-    """
+    """Centres of voxels along each axis (``count`` along the longest), and which are in all masks of frame 0, bool."""
     masks = scene.segmentation(cams, [0])[0] == MOVING
     cameras, box = scene.cameras_at(cams, [0]), torch.from_numpy(scene.bounds).float()
     for size in (COARSE, count):

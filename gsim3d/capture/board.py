@@ -152,24 +152,14 @@ def _initial_poses(names: Sequence[str], views: Sequence[_Views]) -> list[np.nda
 
 
 def _adjust(views, cameras, boards):
-    """Minimises the reprojection errors over lenses, cameras and boards, by Levenberg-Marquardt.
+    """Minimises the reprojection errors over lenses (in ``views``), cameras and boards, by Levenberg-Marquardt.
 
-    A camera alone, seeing few or grazing boards, leaves its focal lengths and principal point uncertain.
-
-    Args:
-        views: detections of each camera; K and distortion are updated.
-        cameras: poses of the cameras.
-        boards: frame -> pose of the board, in the coordinates of the cameras.
-
-    Returns:
-        Cameras, boards, and the residuals [N, 2] of each view of each camera.
+    A camera alone leaves its intrinsics uncertain. Returns cameras, boards, and the residuals [N, 2] of each view.
     """
     start = {("cam", cam): _vector(pose) for cam, pose in enumerate(cameras)}
     start |= {("board", frame): _vector(pose) for frame, pose in boards.items()}
-    lenses = [
-        np.array([v.K[0, 0], v.K[1, 1], *v.K[:2, 2], *v.distortion[:2]]) for v in views
-    ]  # cv2.projectPoints' order
-    start |= {("lens", cam): lens for cam, lens in enumerate(lenses)}
+    for cam, v in enumerate(views):  # in the order of cv2.projectPoints
+        start["lens", cam] = np.array([v.K[0, 0], v.K[1, 1], *v.K[:2, 2], *v.distortion[:2]])
     where = {key: slice(6 * number, 6 * number + 6) for number, key in enumerate(start)}
     x, damping = np.concatenate(list(start.values())), 1e-3
     cost, normal, slope, residuals = _linearised(x, views, where)

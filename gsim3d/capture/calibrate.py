@@ -56,7 +56,13 @@ def calibrate(
         cameras = calibrate_board(films, offsets, board)
     for camera in cameras:
         say(f"  {camera.name}: reprojection error {camera.error:.2f} px, {camera.views} images")
-    _check_fit(cameras, folder, force)
+    bad = [camera for camera in cameras if camera.error > MAX_ERROR * camera.size[0]]
+    if bad and not force:
+        errors = ", ".join(f"{c.name} {c.error:.2f} px (at most {MAX_ERROR * c.size[0]:.2f})" for c in bad)
+        raise InputError(
+            f"{folder}: the calibration does not fit: reprojection error of {errors}; film the board again, sharper "
+            "and closer, with cameras that do not move (--force goes on)"
+        )
     cameras = _scaled(cameras, scale, board is not None, say)
     written = []
     for take, files in takes.items():
@@ -80,16 +86,6 @@ def _offsets(films: Sequence[Film], say: Callable[[str], None]) -> tuple[np.ndar
             why += f", below {MIN_AGREEMENT}: the times in the file are kept; clap once in view of all cameras"
         say(f"  {film.name}: {1000 * offset:+.0f} ms ({why})")
     return offsets, agreement
-
-
-def _check_fit(cameras: Sequence[Calibrated], folder: Path, force: bool) -> None:
-    bad = [camera for camera in cameras if camera.error > MAX_ERROR * camera.size[0]]
-    if bad and not force:
-        errors = ", ".join(f"{c.name} {c.error:.2f} px (at most {MAX_ERROR * c.size[0]:.2f})" for c in bad)
-        raise InputError(
-            f"{folder}: the calibration does not fit: reprojection error of {errors}; film the board again, sharper "
-            "and closer, with cameras that do not move (--force goes on)"
-        )
 
 
 def _scaled(cameras: list[Calibrated], scale, metric: bool, say) -> list[Calibrated]:

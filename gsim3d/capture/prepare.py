@@ -69,7 +69,8 @@ def propose(takes: Sequence[Scene], device: str, say: Callable[[str], None]) -> 
     boxes, pixels = _boxes(takes) if has_masks else ([(0, 0, *size) for size in sizes], max(w * h for w, h in sizes))
     aspect = float(np.median([box[2] / box[3] for box in boxes]))
     longer = min(SIDES[device], max(max(box[2:]) for box in boxes))
-    size = _multiples(longer * min(1, aspect), longer * min(1, 1 / aspect))
+    sides = longer * min(1, aspect), longer * min(1, 1 / aspect)
+    size = tuple(max(2 * SIZE_MULTIPLE, int(side // SIZE_MULTIPLE) * SIZE_MULTIPLE) for side in sides)
     crops = [_shaped(box, size, image) for box, image in zip(boxes, sizes, strict=True)]
     what = f"where bodies move, and {MARGIN:.0%} around" if has_masks else "the whole image, because there are no masks"
     say(f"  crop: {what}; scaled to {size[0]}x{size[1]} pixels, what a model for {device} affords")
@@ -88,8 +89,7 @@ def propose(takes: Sequence[Scene], device: str, say: Callable[[str], None]) -> 
         say(f"  held out: no camera, because {why}")
     else:
         say(f"  held out: camera {first.camera_names[held_out]}, which the others surround best")
-    working = first.fitting.size
-    return Proposal(first.fps, size, tuple(crops), working, bounds, depths, stride, held_out)
+    return Proposal(first.fps, size, tuple(crops), first.fitting.size, bounds, depths, stride, held_out)
 
 
 def _boxes(takes: Sequence[Scene]) -> tuple[list[tuple], float]:
@@ -112,10 +112,6 @@ def _boxes(takes: Sequence[Scene]) -> tuple[list[tuple], float]:
     return [(*a, b[0] - a[0], b[1] - a[1]) for a, b in zip(low, high, strict=True)], max(counts)
 
 
-def _multiples(width: float, height: float) -> tuple[int, int]:
-    return tuple(max(2 * SIZE_MULTIPLE, int(side // SIZE_MULTIPLE) * SIZE_MULTIPLE) for side in (width, height))
-
-
 def _shaped(box: tuple, size: tuple[int, int], image: tuple[int, int]) -> tuple[int, int, int, int]:
     """Returns the smallest box around ``box`` with the aspect of ``size``, moved into the image where it fits."""
     share = max(box[2] / size[0], box[3] / size[1])
@@ -130,8 +126,7 @@ def _shaped(box: tuple, size: tuple[int, int], image: tuple[int, int]) -> tuple[
 def _extent(takes: Sequence[Scene]) -> tuple[list, tuple[float, float]] | None:
     """Returns the box [2][3] in which bodies move, and the range of their depths; None if it is unknown.
 
-    At each of some steps, a sphere encloses the bodies: its centre is nearest to the rays through the centroids of the
-    masks. Unlike visual hulls, spheres do not stretch along the view of cameras that lie close together.
+    Of spheres around the point nearest to the rays through the masks' centroids, which stretch less than visual hulls.
     """
     viewmats, Ks = takes[0].recording.cameras_at_step(0)
     centres, _ = positions_and_axes(viewmats)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsim3d.cameras import Cameras, Frames
+from gsim3d.cameras import Frames
 from gsim3d.data.recording import BACKGROUND, MOVING
 from gsim3d.data.scene import Scene
 from gsim3d.errors import InputError
@@ -33,16 +33,14 @@ def split_scenes(scenes: Sequence, test_fraction: float = 0.12) -> tuple[list, l
     return [s for i, s in enumerate(scenes) if i not in held_out], [scenes[i] for i in sorted(held_out)]
 
 
-def published_split(scenes: Sequence, test_fraction: float = 0.12) -> tuple[list, list]:
+def published_split(scenes: Sequence) -> tuple[list, list]:
     """Splits scenes into (train, test) by the rule of the published evaluation; use only to reproduce its numbers.
 
     With fewer than 15 scenes, the one test scene is also a training scene. With more, the test set may be larger than
-    the fraction (150 of 1200 scenes at 0.12).
+    12 % (150 of 1200 scenes).
     """
-    if not 0 < test_fraction < 1:
-        raise InputError(f"test_fraction must lie between 0 and 1; got {test_fraction}")
     n = len(scenes)
-    n_test = 1 if n < FEW_SCENES else max(1, int(test_fraction * n))
+    n_test = 1 if n < FEW_SCENES else max(1, int(0.12 * n))
     held_out = set(range(0, n, max(1, n // n_test)))
     test = [scenes[i] for i in sorted(held_out)]
     return (list(scenes) if len(test) < FEW_SCENES else [s for i, s in enumerate(scenes) if i not in held_out]), test
@@ -79,7 +77,12 @@ def make_frames(
     masked = all(scene.has_segmentation() for scene in scenes) if masked is None else masked
     images, labels, valid, cameras, cloud_scene, cloud_step, image_cloud = [], [], [], [], [], [], []
     for number, (scene, cams, steps) in enumerate(zip(scenes, cams_per_scene, steps_per_scene)):
-        _check_size(scene, scenes[0])
+        first = scenes[0]
+        if (scene.width, scene.height) != (first.width, first.height):
+            raise InputError(
+                f"{scene.path} has images of {scene.width}x{scene.height} pixels, {first.path} of "
+                f"{first.width}x{first.height}; all scenes of a batch must have one size"
+            )
         steps = [int(s) for s in steps]
         if any(b <= a for a, b in zip(steps, steps[1:])):
             raise InputError(f"{scene.path}: steps must ascend; got {steps}")
@@ -97,9 +100,11 @@ def make_frames(
     labels = torch.cat(labels) if masked else None
     valid = _join_valid(valid, images)
     offsets = np.stack([scene.world_offset for scene in scenes])
+    joined = {name: torch.cat([getattr(c, name) for c in cameras]) for name in ("viewmats", "Ks", "near", "far")}
+    joined["image_cloud"] = torch.tensor(image_cloud, dtype=torch.int64)
     return Frames(
         images=torch.cat(images).float().div_(255),
-        cameras=_join_cameras(cameras, image_cloud),
+        cameras=dataclasses.replace(cameras[0], **joined),
         cloud_scene=torch.tensor(cloud_scene, dtype=torch.int64),
         cloud_step=torch.tensor(cloud_step, dtype=torch.int64),
         origin=torch.from_numpy(np.stack([scene.origin for scene in scenes])),
@@ -139,14 +144,6 @@ def _join_valid(valid: list[Tensor | None], images: list[Tensor]) -> Tensor | No
     return None if bool(joint.all()) else joint
 
 
-def _check_size(scene: Scene, first: Scene) -> None:
-    if (scene.width, scene.height) != (first.width, first.height):
-        raise InputError(
-            f"{scene.path} has images of {scene.width}x{scene.height} pixels, {first.path} of "
-            f"{first.width}x{first.height}; all scenes of a batch must have one size"
-        )
-
-
 def _cams_per_step(cams, n_steps: int, scene: Scene) -> list[list[int]]:
     cams = [list(c) if isinstance(c, (list, tuple, range, np.ndarray)) else c for c in cams]
     if cams and isinstance(cams[0], list):
@@ -154,11 +151,6 @@ def _cams_per_step(cams, n_steps: int, scene: Scene) -> list[list[int]]:
             raise InputError(f"{scene.path}: cameras are given for {len(cams)} steps, but there are {n_steps}")
         return [[int(c) for c in step_cams] for step_cams in cams]
     return [[int(c) for c in cams]] * n_steps
-
-
-def _join_cameras(cameras: list[Cameras], image_cloud: list[int]) -> Cameras:
-    joined = {name: torch.cat([getattr(c, name) for c in cameras]) for name in ("viewmats", "Ks", "near", "far")}
-    return dataclasses.replace(cameras[0], **joined, image_cloud=torch.tensor(image_cloud, dtype=torch.int64))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -167,7 +167,9 @@ def _marked(grey: np.ndarray, lossy: bool) -> np.ndarray | None:
     if len(levels) == 1 or lossy:  # lossy compression keeps 0 and 255, but adds values between
         low, high = 0, full
     soft = (grey > low + (high - low) // 4) & (grey < high - (high - low) // 4)
-    if soft.mean() > MAX_SOFT or _blocks(soft).any() or (lossy and not (grey > high - (high - low) // 4).any()):
+    block = np.ones((5, 5), np.uint8)  # wider than soft borders of JPEG chroma at half resolution
+    wide = cv2.erode(soft.astype(np.uint8), block, borderType=cv2.BORDER_REPLICATE)
+    if soft.mean() > MAX_SOFT or wide.any() or (lossy and not (grey > high - (high - low) // 4).any()):
         return None
     return grey > (low + high) // 2
 
@@ -180,12 +182,6 @@ def _are_labels(grey: np.ndarray, levels: np.ndarray) -> bool:
     block = np.ones((3, 3), np.uint8)
     flat = grey[(cv2.erode(grey, block) == cv2.dilate(grey, block))]
     return 2 * np.isin(inner, flat).sum() >= len(inner)
-
-
-def _blocks(where: np.ndarray) -> np.ndarray:
-    """Erodes bool [h, w] by a 5x5 block."""
-    block = np.ones((5, 5), np.uint8)  # wider than soft borders of JPEG chroma at half resolution
-    return cv2.erode(where.astype(np.uint8), block, borderType=cv2.BORDER_REPLICATE) > 0
 
 
 class ImageCache:

@@ -141,10 +141,7 @@ class Undistorter:
 
 
 def _reach(lens: Lens) -> float:
-    """Returns the tangent of the largest angle up to which the distorted radius increases.
-
-    Beyond it the distortion polynomial is not invertible, and pixels would show wrong directions.
-    """
+    """Returns the tangent of the largest angle up to which the distortion polynomial increases, so is invertible."""
     angles = np.linspace(0, WIDEST, SAMPLES)
     if lens.fisheye:
         k1, k2, k3, k4 = lens.coefficients

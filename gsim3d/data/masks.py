@@ -47,13 +47,9 @@ def background_image(read: Callable[[Sequence[int]], np.ndarray], n_steps: int) 
 
 
 def _frequent(frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the most frequent colours of each pixel, uint8 [FREQUENT, n, 3], and their shares [FREQUENT, n].
+    """Returns the most frequent colours of pixels [S, n, 3], uint8 [FREQUENT, n, 3], and their shares [FREQUENT, n].
 
-    A colour is the mean of the largest set of values of a pixel around one of them. Shares below MIN_SHARE are 0,
-    except the first.
-
-    Args:
-        frames: uint8 [S, n, 3].
+    A colour is the mean of the largest set of values around one of them. Later shares below MIN_SHARE are 0.
     """
     colors, shares = np.zeros((FREQUENT, *frames.shape[1:]), np.uint8), np.zeros((FREQUENT, frames.shape[1]))
     at, left = np.arange(frames.shape[1]), np.ones(frames.shape[:2], bool)  # pixels, and values without a colour

@@ -83,16 +83,7 @@ class _Scan:
 
 @lru_cache(maxsize=10_000)
 def _scan(file: Path, size: tuple[int, int], stamp: tuple) -> _Scan:
-    """Decodes a file once to get the times of its frames.
-
-    Args:
-        file: path.
-        size: expected (width, height).
-        stamp: modification time and size of the file, part of the cache key.
-
-    Raises:
-        InputError: the file is invalid; the message does not include its name.
-    """
+    """Decodes a file once for the times of its frames; ``stamp`` is part of the key, errors do not name the file."""
     index = _index(file)
     capture = _open(file)
     try:
@@ -141,10 +132,7 @@ def _open(file: Path, what: str = ""):
 
 
 def _start(times: np.ndarray, marks: np.ndarray, rate: float) -> float:
-    """Returns the time of the first frame, in seconds from the start of the container.
-
-    OpenCV's ``times`` are relative to that frame; ``marks`` are container times, rounded to frames at ``rate``.
-    """
+    """Returns the time of the first frame in the container: ``times`` count from it, ``marks`` are rounded frames."""
     if not 0 < rate < 1e6:
         return 0.0
     low, high = ((marks - 0.5) / rate - times).max(), ((marks + 0.5) / rate - times).min()
@@ -152,10 +140,7 @@ def _start(times: np.ndarray, marks: np.ndarray, rate: float) -> float:
 
 
 def _even_part(times: np.ndarray, header: float) -> tuple[int, float | None]:
-    """Returns the number of isolated frames at the end, and the rate of the others.
-
-    Cutting without re-encoding can leave such frames: B-frames stored after them, but displayed before, are lost.
-    """
+    """Returns the number of isolated frames at the end, left by cutting without re-encoding, and the others' rate."""
     for cut in range(MAX_APART + 1 if len(times) > MIN_EVEN else 1):
         rate = _even_rate(times[: len(times) - cut], header)
         if rate is not None:
@@ -232,7 +217,9 @@ def _mp4(file: BinaryIO, size: int) -> tuple[int, _Index]:
             end = max(end, stop)
         if kind == b"moov" and stop <= size:
             boxes = list(_boxes(file, start, stop))
-            scale = next((_clock(file, at)[0] for kind, at, _ in boxes if kind == b"mvhd"), 0)
+            clock = next((at for kind, at, _ in boxes if kind == b"mvhd"), None)
+            clock = clock and _read(file, clock + (20 if _read(file, clock, 1) == b"\1" else 12), 4)
+            scale = struct.unpack(">I", clock)[0] if clock else 0
             for kind, at, last in boxes:
                 if kind == b"trak" and _is_video(file, at, last):
                     index = next((_track(file, a, scale) for k, a, _ in _boxes(file, at, last) if k == b"tkhd"), index)
@@ -266,10 +253,6 @@ def _track(file: BinaryIO, at: int, scale: int) -> _Index:
     duration = int.from_bytes(_read(file, at + (28 if wide else 20), 8 if wide else 4), "big")
     a, b, _, c, d = struct.unpack(">5i", _read(file, at + (52 if wide else 40), 20))
     return _Index(a * d < b * c, duration / scale if scale and duration < 1 << 31 else None)
-
-
-def _clock(file: BinaryIO, at: int) -> tuple[int]:
-    return struct.unpack(">I", _read(file, at + (20 if _read(file, at, 1) == b"\1" else 12), 4))
 
 
 def _read(file: BinaryIO, at: int, count: int) -> bytes:

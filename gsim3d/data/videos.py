@@ -59,7 +59,8 @@ def read(folder: Path, problems: Problems) -> Recording:
     sizes = {name: entry.size("size") for name, entry in entries.items()}
     sources = {name: _frames_of(folder, name, sizes[name], source, problems) for name in names}
     fps, resample = description.positive("fps"), description.positive("resample")
-    offsets = {name: _offset(entry) for name, entry in entries.items()}
+    given = {n: array(e.values.get("offset", 0), [()], f"{e.where}offset", problems) for n, e in entries.items()}
+    offsets = {name: 0.0 if offset is None else float(offset) for name, offset in given.items()}
     numbers, rate, notes = _steps(sources, offsets, fps, resample, source, problems)
     unit, center = _unit(description), _pixel_center(description)
     cameras = [_camera(entry, name, sizes[name], len(numbers[0]), unit, center) for name, entry in entries.items()]
@@ -110,12 +111,6 @@ def _entries(description: Description) -> dict[str, Description]:
             raise InputError(f"{description.where}two cameras have the same name: {name}")
         found[name] = Description(entry, f"{description.where}camera {name}: ", description.problems)
     return found
-
-
-def _offset(entry: Description) -> float:
-    """Returns the seconds to add to a camera's times."""
-    found = array(entry.values.get("offset", 0), [()], f"{entry.where}offset", entry.problems)
-    return 0.0 if found is None else float(found)
 
 
 def _unit(description: Description) -> float:

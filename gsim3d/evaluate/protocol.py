@@ -418,10 +418,7 @@ def score_scenes(
 
 
 def _batches(restored: Restored, scenes: Sequence[Scene], contexts: Sequence[Sequence[int]]) -> list[list[int]]:
-    """Groups consecutive scenes into batches on a GPU; on a CPU every scene is its own batch.
-
-    Batches do not depend on the number of processes, so that scores do not either.
-    """
+    """Groups consecutive scenes into batches on a GPU, for any number of processes; on a CPU each is its own."""
     found: list[list[int]] = []
     for number, (scene, context) in enumerate(zip(scenes, contexts, strict=True)):
         kind = scene.has_segmentation(), len(context)

@@ -15,6 +15,7 @@ from gsim3d.synth.mesh_files import SUFFIXES
 ASSETS = Path(__file__).parent / "assets"
 MESH_BODIES = {"spot": ASSETS / "spot.obj"}
 OBJECTS = (*shapes.SHAPES, *MESH_BODIES)
+_mesh_body = cache(meshes.load_body)
 GENESIS = "genesis:"  # prefix of meshes of the package genesis-world
 
 # Friction and bounce of rigid bodies, for worlds in which they depend on the name only.
@@ -36,15 +37,10 @@ def name_rng(name: str) -> np.random.Generator:
 def named_body(name: str, rng: np.random.Generator) -> shapes.Body:
     """Returns the body ``name`` of OBJECTS; ``rng`` draws pattern and colours of procedural bodies."""
     if name in MESH_BODIES:
-        return _mesh_body(name)
+        return _mesh_body(MESH_BODIES[name])
     if name not in shapes.SHAPES:
         raise InputError(f"object {name!r} is not known; choose from {', '.join(OBJECTS)} or give a mesh file")
     return shapes.procedural_body(name, rng)
-
-
-@cache
-def _mesh_body(name: str) -> shapes.Body:
-    return meshes.load_body(MESH_BODIES[name])
 
 
 def mesh_name(text: str) -> str:

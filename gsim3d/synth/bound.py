@@ -121,10 +121,7 @@ def read_world(folder: Path) -> World:
 
 
 def _scene_errors(world: World, scene: tuple[str, int], folder: Path, out: Path | None):
-    """(scene, squared errors float32 [samples + 1, steps, cameras, metrics]) of each sample and of their mean image.
-
-    NaN for empty masks.
-    """
+    """(scene, squared errors float32 [samples + 1, steps, cameras, metrics]) of samples, then mean; NaN: no mask."""
     if not writer.is_finished(folder, world.fingerprint(scene[0])):
         raise InputError(f"{folder} is not finished: run gsim3d generate again")
     key = json.dumps([world.fingerprint(scene[0]), dataclasses.asdict(ERRORS[world.name]), GIVEN, SAMPLES])
@@ -188,10 +185,7 @@ def _simulated(world: World, scene: tuple[str, int], attempt: int, sample: int) 
 
 
 def _with_errors(start: SceneBody, errors: StartErrors, fps: float, rng: np.random.Generator) -> SceneBody:
-    """Adds errors at time 0 whose magnitudes at the last input step are ``errors``.
-
-    Bodies are in free flight until then, so the errors of velocity and spin are integrated back to time 0.
-    """
+    """Adds errors at time 0 that are ``errors`` at the last input step, until which bodies are in free flight."""
     body, before = start.body, GIVEN - 1
     velocity = errors.velocity * _direction(rng)
     spin = errors.spin * np.linalg.norm(body.spin) * _direction(rng)

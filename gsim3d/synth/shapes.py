@@ -55,18 +55,6 @@ def _radial(radius: Callable[[np.ndarray], np.ndarray]):
     return build
 
 
-def _sphere(d):
-    return np.ones(len(d))
-
-
-def _ellipsoid(d):
-    return 1 / np.sqrt((d[:, 0] / 1.0) ** 2 + (d[:, 1] / 0.82) ** 2 + (d[:, 2] / 0.7) ** 2)
-
-
-def _rounded_box(d):
-    return (np.abs(d) ** 6).sum(1) ** (-1 / 6)
-
-
 def _blob(d):
     x, y, z = d.T
     return 1 + 0.22 * np.sin(3 * x + 1) * np.cos(2.5 * y) + 0.18 * np.sin(4 * z + 2 * x) + 0.1 * np.cos(5 * y - 2 * z)
@@ -96,11 +84,6 @@ def _torus(level):
     reach = 1 + 0.5 * np.cos(b)
     vertices = np.stack([reach * np.cos(a), reach * np.sin(a), np.broadcast_to(0.5 * np.sin(b), (n_ring, n_tube))], -1)
     return vertices.reshape(-1, 3), _tube_faces(n_ring, n_tube)
-
-
-def _cross(d):
-    # Six arms along the axes.
-    return 0.52 + 0.62 * np.exp((np.abs(d).max(1) - 1) * 9)
 
 
 def _pyramid(d):
@@ -165,16 +148,16 @@ def _tube_faces(n_ring: int, n_tube: int) -> np.ndarray:
 
 
 SHAPES = {
-    "ball": _radial(_sphere),
+    "ball": _radial(lambda d: np.ones(len(d))),
     "blob": _radial(_blob),
-    "box": _radial(_rounded_box),
+    "box": _radial(lambda d: (np.abs(d) ** 6).sum(1) ** (-1 / 6)),
     "capsule": _capsule,
-    "ellipsoid": _radial(_ellipsoid),
+    "ellipsoid": _radial(lambda d: 1 / np.sqrt((d[:, 0] / 1.0) ** 2 + (d[:, 1] / 0.82) ** 2 + (d[:, 2] / 0.7) ** 2)),
     "star": _radial(_star),
     "torus": _torus,
     "cone": _turned([(0.0, 0.6), (0.62, -0.5)]),
     "cylinder": _turned([(0.0, 0.55), (0.5, 0.55), (0.5, -0.55), (0.0, -0.55)]),
-    "cross": _radial(_cross),
+    "cross": _radial(lambda d: 0.52 + 0.62 * np.exp((np.abs(d).max(1) - 1) * 9)),  # six arms along the axes
     "dumbbell": _dumbbell,
     "knot": _knot,
     "pyramid": _radial(_pyramid),
@@ -188,11 +171,6 @@ def _stripes(p, colors):
     return colors[band % 3]
 
 
-def _checker(p, colors):
-    cell = np.floor(p * 5 + 0.5).astype(np.int64).sum(1)
-    return colors[cell % 2]
-
-
 def _dots(p, colors):
     offset = p * 4 - np.round(p * 4)
     return np.where((offset**2).sum(1, keepdims=True) < 0.12, colors[1], colors[0])
@@ -203,7 +181,12 @@ def _patches(p, colors):
     return colors[np.digitize(wave, [-0.6, 0.6])]
 
 
-PATTERNS = {"checker": _checker, "dots": _dots, "patches": _patches, "stripes": _stripes}
+PATTERNS = {
+    "checker": lambda p, colors: colors[np.floor(p * 5 + 0.5).astype(np.int64).sum(1) % 2],
+    "dots": _dots,
+    "patches": _patches,
+    "stripes": _stripes,
+}
 
 
 def normalise(vertices: np.ndarray) -> tuple[np.ndarray, float]:

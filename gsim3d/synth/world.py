@@ -306,7 +306,7 @@ class World(ABC):
         part = np.arange(n) / (n - 1) - 0.5
         points = np.stack(np.meshgrid(part, part, [0.0], indexing="ij"), -1).reshape(-1, 3)
         faces = grid_faces(n)
-        paint = _plain_cloth if self.by_name else shapes.random_paint(rng)
+        paint = (lambda p: np.broadcast_to(CLOTH_COLOR, p.shape)) if self.by_name else shapes.random_paint(rng)
         return render.Surface(faces, points[faces], paint, two_sided=True)
 
     def _with_actors(self, drawn: SceneDraw, rng: np.random.Generator) -> SceneDraw:
@@ -336,7 +336,3 @@ class World(ABC):
                 raise Rejected("a body leaves the view of a camera")
             if ground is not None and np.hypot(frame[:, 0], frame[:, 1]).max() > 1.25 * self.ground_radius:
                 raise Rejected("a body leaves the ground")
-
-
-def _plain_cloth(points: np.ndarray) -> np.ndarray:
-    return np.broadcast_to(CLOTH_COLOR, points.shape)

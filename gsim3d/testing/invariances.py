@@ -366,8 +366,7 @@ def _pixels_of_particles(frames: Frames) -> Tensor:
 
 
 def _compare_batches(simulator: Simulator, sample: Sample, scenes: Sequence[int]) -> Iterator[Deviation]:
-    """Deviations of a batch of ``scenes`` from the whole sample. The encoder has a bound, since the rounding of dense
-    convolutions depends on the number of images."""
+    """Deviations of a batch of ``scenes`` from the sample; convolutions of the encoder round by number of images."""
     state = simulator.encode(sample.frames)
     packed = take_scenes_of_particles(state, scenes)
     yield from compare_particles("encode", simulator.encode(take_scenes(sample.frames, scenes)), packed, BOUND)

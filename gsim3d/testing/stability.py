@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -28,6 +27,7 @@ from gsim3d.simulator import Simulator
 from gsim3d.synth.cameras import look_at
 from gsim3d.testing.invariances import INVARIANCES, Deviation, Sample
 from gsim3d.testing.stress import STRESS_TESTS
+from gsim3d.train.log import plain
 from gsim3d.train.restore import PRESETS, Restored, build_simulator, restore
 from gsim3d.train.samples import context_cameras, spread_views, subsampled
 
@@ -284,18 +284,9 @@ def write_report(report: Report, out: Path) -> None:
             lines += [f"- {deviation}" for deviation in finding.failures[:20]]
             lines += [f"- and {more} more"] if (more := len(finding.failures) - 20) > 0 else []
             lines += ["", f"Reproduce: `gsim3d doctor --stability --replay {finding.file}`"]
-    plain = _plain({"healthy": report.healthy, **dataclasses.asdict(report)})
-    for name, content in {"report.md": "\n".join(lines), "report.json": json.dumps(plain, indent=1)}.items():
+    values = json.dumps(plain({"healthy": report.healthy, **dataclasses.asdict(report)}), indent=1)
+    for name, content in {"report.md": "\n".join(lines), "report.json": values}.items():
         write_whole(out / name, content, "\n")
-
-
-def _plain(value: Any) -> Any:
-    """Converts infinite numbers to strings, for JSON."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, (tuple, list)):
-        return [_plain(item) for item in value]
-    return str(value) if isinstance(value, float) and not value < math.inf else value
 
 
 def check_stability(

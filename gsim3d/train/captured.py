@@ -397,8 +397,7 @@ class _OfCalls:
 def _aliased(module: nn.Module) -> Iterator[list[Tensor]]:
     """Replaces the parameters of ``module`` by aliases of the same memory; yields them in order of ``parameters()``.
 
-    With shared parameters, autograd would add gradients call by call in thousands of small kernels; gradients of
-    aliases are added by a few multi-tensor kernels.
+    Gradients of aliases are added by a few multi-tensor kernels instead of thousands, call by call.
     """
     owners = [
         (part, name, value)

@@ -244,7 +244,7 @@ def plain(value: Any) -> Any:
     """Converts numbers that are not finite to strings, because JSON has no NaN."""
     if isinstance(value, dict):
         return {name: plain(item) for name, item in value.items()}
-    if isinstance(value, list):
+    if isinstance(value, (list, tuple)):
         return [plain(item) for item in value]
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 

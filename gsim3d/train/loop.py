@@ -323,12 +323,7 @@ class Trainer:
     def _gradients(
         self, samples: list[int], watch: StepWatch | None = None, factor: float = 1.0
     ) -> tuple[Tensor, Tensor, Sequence[Tensor | None], StepWatch]:
-        """Computes the loss of ``samples`` and its gradients, multiplied by the loss scale and ``factor``.
-
-        Returns:
-            Loss, errors by step, gradient of each parameter (None if unused), and statistics. With CUDA graphs, the
-            next call overwrites the gradients.
-        """
+        """Returns loss, errors by step, gradients times ``factor`` and loss scale (a graph reuses them), statistics."""
         watch, factor = watch or StepWatch(), factor * self.scale.value
         if self.captured is not None:
             prepared = self._prepared(samples)
