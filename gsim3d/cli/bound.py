@@ -27,18 +27,14 @@ With --out, an interrupted command continues when it is run again.
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Scores a perfect simulator whose initial state has the uncertainty of the input images."
     parser.epilog = EPILOG
-    parser.add_argument("set", metavar="SET", help="data set of gsim3d generate")
-    parser.add_argument(
-        "--given",
-        metavar="DB|FILE",
-        help="a model's error of the input steps: masked PSNR in dB, or metrics.json of gsim3d evaluate",
-    )
-    parser.add_argument("--trajectories", type=whole(1), metavar="N", help="number of trajectories (default: all)")
-    parser.add_argument("--out", metavar="DIR", help="folder for bound.json and the errors of each scene")
-    parser.add_argument(
-        "--processes", type=whole(1), metavar="N", help="number of processes (default: number of cores)"
-    )
-    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    add = parser.add_argument
+    add("set", metavar="SET", help="data set of gsim3d generate")
+    help = "a model's error of the input steps: masked PSNR in dB, or metrics.json of gsim3d evaluate"
+    add("--given", metavar="DB|FILE", help=help)
+    add("--trajectories", type=whole(1), metavar="N", help="number of trajectories (default: all)")
+    add("--out", metavar="DIR", help="folder for bound.json and the errors of each scene")
+    add("--processes", type=whole(1), metavar="N", help="number of processes (default: number of cores)")
+    add("--quiet", action="store_true", help="no progress bar")
 
 
 def run(args: argparse.Namespace) -> int:

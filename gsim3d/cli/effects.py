@@ -26,16 +26,15 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Finds the effects that a scene requires, and writes them to effects.yaml."
     parser.epilog = EPILOG
-    parser.add_argument("action", choices=("infer",), help="infer: disable effects one by one and compare")
-    parser.add_argument("scene", metavar="SCENE", help="scene folder of any layout (docs/reference/data.md)")
-    parser.add_argument("checkpoint", metavar="CHECKPOINT", help=CHECKPOINT_HELP)
-    parser.add_argument(
-        "--tolerance", type=decibels, default="0.1dB", metavar="X", help="largest loss of PSNR (default: 0.1dB)"
-    )
-    parser.add_argument("--out", metavar="FILE", help="file to write; must not exist (default: SCENE/effects.yaml)")
+    add = parser.add_argument
+    add("action", choices=("infer",), help="infer: disable effects one by one and compare")
+    add("scene", metavar="SCENE", help="scene folder of any layout (docs/reference/data.md)")
+    add("checkpoint", metavar="CHECKPOINT", help=CHECKPOINT_HELP)
+    add("--tolerance", type=decibels, default="0.1dB", metavar="X", help="largest loss of PSNR (default: 0.1dB)")
+    add("--out", metavar="FILE", help="file to write; must not exist (default: SCENE/effects.yaml)")
     add_fitting(parser)
-    parser.add_argument("--quiet", action="store_true", help="no progress bar")
-    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="device (default: cpu)")
+    add("--quiet", action="store_true", help="no progress bar")
+    add("--device", choices=("cpu", "cuda"), default="cpu", help="device (default: cpu)")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -59,13 +59,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     cameras = {"type": whole(0), "nargs": "+", "metavar": "CAM"}
     add("checkpoint", metavar="CHECKPOINT", nargs="?", help=checkpoint)
     add("data", metavar="DATA", help="folder with scenes, or scene folder; or a report to compare with --against")
-    add(
-        "--predictions",
-        metavar="[NAME=]DIR",
-        action="append",
-        default=[],
-        help="predictions of another model to score; may be repeated",
-    )
+    help = "predictions of another model to score; may be repeated"
+    add("--predictions", metavar="[NAME=]DIR", action="append", default=[], help=help)
     add(
         "--baselines",
         nargs="+",
@@ -94,11 +89,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--context", help="input cameras (default: evenly spaced)", **cameras)
     add("--metrics", nargs="+", metavar="METRIC", help="metrics (default: all whose weights are installed)")
     add("--clips", type=whole(2), default=48, metavar="N", help="largest number of clips for FVD (default: 48)")
-    add(
-        "--trust",
-        action="store_true",
-        help="also report how well the bounds of errors hold, on generated scenes (predicts 3 variants of each scene)",
-    )
+    help = "also report how well the bounds of errors hold, on generated scenes (predicts 3 variants of each scene)"
+    add("--trust", action="store_true", help=help)
     add(
         "--calibrate-trust",
         action="store_true",

@@ -24,21 +24,21 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Write 3D Gaussians in a format that other tools open, or as a video."
     parser.epilog = EPILOG
-    parser.add_argument(
-        "target", metavar="TARGET", help="a file of Gaussians, a folder with one a frame, or what gsim3d simulate wrote"
-    )
-    parser.add_argument("--to", metavar="FILE", required=True, help="file to write; must not exist yet")
-    parser.add_argument("--frame", type=whole(-(10**6), 10**6), metavar="N", help="one frame; negative: from the end")
-    parser.add_argument("--fps", type=number(0, 1e6, above=True), help="frames a second (default: TARGET's, else 24)")
-    parser.add_argument("--up", choices=("y", "z"), help="axis that points up in TARGET (default: as its format says)")
-    parser.add_argument("--up-to", choices=("y", "z"), help="the same in FILE (default: as its readers expect)")
-    parser.add_argument("--size", type=whole(16, 4096), default=512, metavar="PX", help="of a video (default 512)")
+    add = parser.add_argument
+    help = "a file of Gaussians, a folder with one a frame, or what gsim3d simulate wrote"
+    add("target", metavar="TARGET", help=help)
+    add("--to", metavar="FILE", required=True, help="file to write; must not exist yet")
+    add("--frame", type=whole(-(10**6), 10**6), metavar="N", help="one frame; negative: from the end")
+    add("--fps", type=number(0, 1e6, above=True), help="frames a second (default: TARGET's, else 24)")
+    add("--up", choices=("y", "z"), help="axis that points up in TARGET (default: as its format says)")
+    add("--up-to", choices=("y", "z"), help="the same in FILE (default: as its readers expect)")
+    add("--size", type=whole(16, 4096), default=512, metavar="PX", help="of a video (default 512)")
     turns = "of a video's camera (default 0.25; 1 around a single frame)"
-    parser.add_argument("--turns", type=number(-1e3, 1e3), help=turns)
+    add("--turns", type=number(-1e3, 1e3), help=turns)
 
-    parser.add_argument("--scene", metavar="SCENE", help="recorded scene that TARGET predicts: truth beside it")
-    parser.add_argument("--start", type=whole(0), default=0, help="step of SCENE that is shown first (default 0)")
-    parser.add_argument("--camera", type=whole(0), default=0, metavar="CAM", help="of SCENE (default 0)")
+    add("--scene", metavar="SCENE", help="recorded scene that TARGET predicts: truth beside it")
+    add("--start", type=whole(0), default=0, help="step of SCENE that is shown first (default 0)")
+    add("--camera", type=whole(0), default=0, metavar="CAM", help="of SCENE (default 0)")
 
 
 def run(args: argparse.Namespace) -> int:

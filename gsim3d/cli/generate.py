@@ -63,13 +63,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--size", dest="image_size", type=whole(16, 4096), metavar="PX", help="width and height of the images")
     add("--frames", dest="n_frames", type=whole(1), metavar="N", help="steps of a trajectory")
     add("--fps", type=number(0, above=True), help="steps a second")
-    add(
-        "--trajectories",
-        dest="n_trajectories",
-        type=whole(1),
-        metavar="N",
-        help="number of scenes, assigned to objects in turn",
-    )
+    help = "number of scenes, assigned to objects in turn"
+    add("--trajectories", dest="n_trajectories", type=whole(1), metavar="N", help=help)
     add("--seed", type=whole(0), help="random seed (default 0)")
     objects = "ball,blob,box,capsule,cone,cylinder,ellipsoid,spot,star,torus"
     add("--objects", type=_names, metavar="A,B", help=f"{objects} (default: those of the preset), or none")

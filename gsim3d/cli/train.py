@@ -28,24 +28,19 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Trains a simulator on multi-view video; writes checkpoints and a log into a run folder."
     parser.epilog = EPILOG
-    parser.add_argument("config", metavar="CONFIG", nargs="?", help="YAML file with the run's settings")
-    parser.add_argument("--data", metavar="DIR", help="folder with scenes of any layout (docs/reference/data.md)")
-    parser.add_argument(
-        "--cache", metavar="DIR", help="cache decoded images in this folder, for data sets larger than memory"
-    )
-    parser.add_argument("--out", metavar="DIR", help="run folder, created if absent")
-    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="device (default: cpu)")
-    parser.add_argument(
-        "--until", type=whole(1), metavar="STEP", help="stop after this optimizer step (default: the last)"
-    )
-    parser.add_argument("--export", metavar="FILE", help="also write the result as one .safetensors file")
-    parser.add_argument("--tensorboard", action="store_true", help="also log to OUT/tensorboard, with sample videos")
-    parser.add_argument("--wandb", action="store_true", help="also log to Weights & Biases (see its own settings)")
-    parser.add_argument(
-        "--viewer", action="store_true", help="show the prediction of a held-out scene, updated at each checkpoint"
-    )
-    parser.add_argument("--profile", action="store_true", help="write a trace of two steps to OUT/profile")
-    parser.add_argument("--print-config", action="store_true", help="print all settings with their defaults and exit")
+    add = parser.add_argument
+    add("config", metavar="CONFIG", nargs="?", help="YAML file with the run's settings")
+    add("--data", metavar="DIR", help="folder with scenes of any layout (docs/reference/data.md)")
+    add("--cache", metavar="DIR", help="cache decoded images in this folder, for data sets larger than memory")
+    add("--out", metavar="DIR", help="run folder, created if absent")
+    add("--device", choices=("cpu", "cuda"), default="cpu", help="device (default: cpu)")
+    add("--until", type=whole(1), metavar="STEP", help="stop after this optimizer step (default: the last)")
+    add("--export", metavar="FILE", help="also write the result as one .safetensors file")
+    add("--tensorboard", action="store_true", help="also log to OUT/tensorboard, with sample videos")
+    add("--wandb", action="store_true", help="also log to Weights & Biases (see its own settings)")
+    add("--viewer", action="store_true", help="show the prediction of a held-out scene, updated at each checkpoint")
+    add("--profile", action="store_true", help="write a trace of two steps to OUT/profile")
+    add("--print-config", action="store_true", help="print all settings with their defaults and exit")
 
 
 def run(args: argparse.Namespace) -> int:

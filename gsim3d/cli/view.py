@@ -24,11 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("target", metavar="TARGET", help="run, its state, scene folder, file of Gaussians, or folder with one a frame")
     add("--scene", metavar="SCENE", help="recorded scene that TARGET predicts")
-    add(
-        "--checkpoint",
-        metavar="CHECKPOINT",
-        help=f"simulator that goes on from a scene or state: {CHECKPOINT_HELP}",
-    )
+    add("--checkpoint", metavar="CHECKPOINT", help=f"simulator that goes on from a scene or state: {CHECKPOINT_HELP}")
     add("--start", type=whole(0), default=0, help="step of the scene that is shown first (default: 0)")
     add("--steps", type=whole(1), help="steps to predict with --checkpoint (default: to the end of the video)")
     add_fitting(parser)
