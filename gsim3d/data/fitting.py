@@ -53,23 +53,16 @@ def resample(recording: Recording, fps: float) -> Recording:
 
 @dataclass(frozen=True)
 class Fitting:
-    """How recordings are converted for a model; the defaults change nothing.
+    """How recordings are converted for a model; the defaults change nothing."""
 
-    Attributes:
-        size: (width, height) in pixels. Images are resized to cover it (bilinear, antialiased) and centre-cropped.
-        near_far: depth range of all scenes in metres, after ``unit_cameras``.
-        unit_cameras: divide lengths by the largest camera coordinate of the scene's first step.
-        slack: scenes whose own near or far differs from ``near_far`` by more than this factor keep their own.
-        enlarge: upsample images smaller than ``size``; otherwise they are an error.
-        whole: resize images to fit into ``size`` and pad them, instead of cropping.
-    """
-
+    #: (width, height) in pixels. Images are resized to cover it (bilinear, antialiased) and centre-cropped.
     size: tuple[int, int] | None = None
-    near_far: tuple[float, float] | None = None
-    unit_cameras: bool = False
+    near_far: tuple[float, float] | None = None  #: depth range of all scenes in metres, after ``unit_cameras``
+    unit_cameras: bool = False  #: divide lengths by the largest camera coordinate of the scene's first step
+    #: scenes whose own near or far differs from ``near_far`` by more than this factor keep their own
     slack: float = math.inf
-    enlarge: bool = False
-    whole: bool = False
+    enlarge: bool = False  #: upsample images smaller than ``size``; otherwise they are an error
+    whole: bool = False  #: resize images to fit into ``size`` and pad them, instead of cropping
 
 
 def fit(recording: Recording, fitting: Fitting) -> Recording:

@@ -78,48 +78,30 @@ class Camera:
 
 @dataclass(frozen=True)
 class Recording:
-    """One recorded scene in gsim3d's conventions (OpenCV axes, pixel centres at +0.5, metres).
+    """One recorded scene in gsim3d's conventions (OpenCV axes, pixel centres at +0.5, metres)."""
 
-    Attributes:
-        layout: name of the layout.
-        source: file that describes the cameras.
-        n_steps: number of steps.
-        fps: steps per second.
-        camera_names: V names, for messages.
-        viewmats: float64 [S, V, 4, 4], world-to-camera; S is 1 for static cameras, else n_steps.
-        Ks: float64 [S, V, 3, 3]; S is 1 or n_steps.
-        sizes: (width, height) of each camera's images.
-        read_images: reader of images, uint8 RGB [h, w, 3].
-        read_labels: reader of labels, uint8 [h, w] of BACKGROUND, FIXED, MOVING; None if there are no labels.
-        distortions: lens of each camera, None for a pinhole; images are still distorted.
-        near, far, origin, bounds: None if the description does not give them.
-        real_background: the images show a real background, which is masked to black where labels are 0.
-        subtract_background: derive labels by background subtraction.
-        notes: remarks about skipped or changed data; check-data prints them.
-        world_offset: float64 [3] metres, origin of all positions in the coordinates of the files; readers return 0.
-        actions: points of actors; None: no actors.
-    """
-
-    layout: str
-    source: Path
-    n_steps: int
-    fps: float
-    camera_names: tuple[str, ...]
-    viewmats: np.ndarray
-    Ks: np.ndarray
-    sizes: tuple[tuple[int, int], ...]
-    read_images: ReadImages
+    layout: str  #: name of the layout
+    source: Path  #: file that describes the cameras
+    n_steps: int  #: number of steps
+    fps: float  #: steps per second
+    camera_names: tuple[str, ...]  #: V names, for messages
+    viewmats: np.ndarray  #: float64 [S, V, 4, 4], world-to-camera; S is 1 for static cameras, else n_steps
+    Ks: np.ndarray  #: float64 [S, V, 3, 3]; S is 1 or n_steps
+    sizes: tuple[tuple[int, int], ...]  #: (width, height) of each camera's images
+    read_images: ReadImages  #: reader of images, uint8 RGB [h, w, 3]
+    #: reader of labels, uint8 [h, w] of BACKGROUND, FIXED, MOVING; None if there are no labels
     read_labels: ReadImages | None = None
-    distortions: tuple[Lens | None, ...] = ()
-    near: float | None = None
-    far: float | None = None
-    origin: np.ndarray | None = None
-    bounds: np.ndarray | None = None
-    real_background: bool = False
-    subtract_background: bool = False
-    notes: tuple[str, ...] = ()
+    distortions: tuple[Lens | None, ...] = ()  #: lens of each camera, None for a pinhole; images are still distorted
+    near: float | None = None  #: None if the description does not give it
+    far: float | None = None  #: None if the description does not give it
+    origin: np.ndarray | None = None  #: None if the description does not give it
+    bounds: np.ndarray | None = None  #: None if the description does not give it
+    real_background: bool = False  #: the images show a real background, which is masked to black where labels are 0
+    subtract_background: bool = False  #: derive labels by background subtraction
+    notes: tuple[str, ...] = ()  #: remarks about skipped or changed data; check-data prints them
+    #: float64 [3] metres, origin of all positions in the coordinates of the files; readers return 0
     world_offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    actions: RecordedActions | None = None
+    actions: RecordedActions | None = None  #: points of actors; None: no actors
 
     @classmethod
     def of_cameras(cls, cameras: Sequence[Camera], n_steps: int, **others: Any) -> Recording:

@@ -38,13 +38,9 @@ from gsim3d.synth.scene_setup import GRAVITY
 
 @dataclass(frozen=True)
 class ActorRows(Selection):
-    """The particles whose attribute ``actor`` is ``number``.
+    """The particles whose attribute ``actor`` is ``number``."""
 
-    Attributes:
-        number: of the actor.
-    """
-
-    number: int = 0
+    number: int = 0  #: of the actor
 
     def mask(self, particles: Particles) -> Tensor:
         return particles.actor == self.number
@@ -52,31 +48,20 @@ class ActorRows(Selection):
 
 @dataclass(frozen=True)
 class ModelState:
-    """State of :class:`ModelScenes`.
+    """State of :class:`ModelScenes`."""
 
-    Attributes:
-        particles: last steps of every scene; ``actor`` marks the particles of actors.
-        actors: float64 [n, L, A, 3] metres, centers of the actors in the last L steps.
-    """
-
-    particles: Particles
-    actors: Tensor
+    particles: Particles  #: last steps of every scene; ``actor`` marks the particles of actors
+    actors: Tensor  #: float64 [n, L, A, 3] metres, centers of the actors in the last L steps
 
 
 @dataclass(frozen=True)
 class Start:
-    """Images that a scene is encoded from.
+    """Images that a scene is encoded from."""
 
-    Attributes:
-        views: of the last steps, the newest last.
-        actors: [L, A, 3] metres, centers of the actors in these steps.
-        scene: whose bodies these are; its positions are not read.
-        centers: centers of the bodies now [B, 3] in metres. Default: the middles of the boxes around their particles.
-    """
-
-    views: Sequence[render.View]
-    actors: np.ndarray
-    scene: TrueScene
+    views: Sequence[render.View]  #: of the last steps, the newest last
+    actors: np.ndarray  #: [L, A, 3] metres, centers of the actors in these steps
+    scene: TrueScene  #: whose bodies these are; its positions are not read
+    #: centers of the bodies now [B, 3] in metres. Default: the middles of the boxes around their particles.
     centers: np.ndarray | None = None
 
 

@@ -18,15 +18,10 @@ FINAL = 2.0  # weight of the last distance to the goal beside the mean
 
 @dataclass(frozen=True)
 class PushStates:
-    """Predicted positions of K sequences, metres; not finite where the simulation failed.
+    """Predicted positions of K sequences, metres; not finite where the simulation failed."""
 
-    Attributes:
-        centers: [K, H, 2] of the body.
-        pusher: [K, H, 2].
-    """
-
-    centers: Tensor
-    pusher: Tensor
+    centers: Tensor  #: [K, H, 2] of the body
+    pusher: Tensor  #: [K, H, 2]
 
 
 class TrueDynamics:
@@ -84,12 +79,9 @@ class GoalCost:
 
     ``mean_t |c_t - g| + 2 |c_H - g| + 0.3 mean_t |p_t - b_t|`` with ``b = c + d (c - g) / |c - g|``. Without the last
     term all sequences that do not reach the body have the same cost.
-
-    Attributes:
-        goal: [2] metres.
     """
 
-    goal: Tensor
+    goal: Tensor  #: [2] metres
 
     def __call__(self, states: PushStates, actions: Tensor) -> Tensor:
         away = states.centers - self.goal.to(states.centers)

@@ -25,48 +25,27 @@ Views = list[tuple[Sequence[int] | None, Sequence[int]]]  # (input cameras, targ
 
 @dataclass(frozen=True)
 class Job:
-    """The options of ``gsim3d evaluate``.
+    """The options of ``gsim3d evaluate``."""
 
-    Attributes:
-        data: folder with scenes, or a report to compare.
-        checkpoint: see :func:`gsim3d.train.restore.restore`; None scores only ``predictions``.
-        predictions: "[NAME=]DIR" of other models.
-        baselines: names of :data:`gsim3d.baselines.BASELINES`, fitted to each scene.
-        given: number of input steps of the other models, if there is no checkpoint.
-        scenes: "test", "train" or "all"; None means "all" for held-out data sets, else "test".
-        split: "gsim3d" or "published", the rule that holds scenes out.
-        steps: number of steps to predict; None predicts to the end of the shortest video.
-        cameras: target cameras; None uses those excluded from the training's inputs.
-        context: input cameras; None spaces them evenly.
-        metrics: metrics to measure; None measures all whose weights are installed.
-        clips: largest number of clips for FVD.
-        trust: also report how well the calibrated bounds of errors hold.
-        calibrate_trust: calibrate the bounds and write them beside the checkpoint, instead of scoring.
-        keep, resample: see :meth:`gsim3d.train.restore.Restored.open_scene`.
-        against: report of another model to compare with.
-        device: "cpu" or "cuda".
-        out: JSON file; None writes metrics.json next to the checkpoint or predictions.
-    """
-
-    data: str
-    checkpoint: str | None = None
-    predictions: Sequence[str] = ()
-    baselines: Sequence[str] = ()
-    given: int | None = None
-    scenes: str | None = None
-    split: str = "gsim3d"
-    steps: int | None = None
-    cameras: Sequence[int] | None = None
-    context: Sequence[int] | None = None
-    metrics: Sequence[str] | None = None
-    clips: int = 48
-    trust: bool = False
-    calibrate_trust: bool = False
-    keep: Sequence[str] = ()
-    resample: bool = False
-    against: str | None = None
-    device: str = "cpu"
-    out: str | None = None
+    data: str  #: folder with scenes, or a report to compare
+    checkpoint: str | None = None  #: see :func:`gsim3d.train.restore.restore`; None scores only ``predictions``
+    predictions: Sequence[str] = ()  #: "[NAME=]DIR" of other models
+    baselines: Sequence[str] = ()  #: names of :data:`gsim3d.baselines.BASELINES`, fitted to each scene
+    given: int | None = None  #: number of input steps of the other models, if there is no checkpoint
+    scenes: str | None = None  #: "test", "train" or "all"; None means "all" for held-out data sets, else "test"
+    split: str = "gsim3d"  #: "gsim3d" or "published", the rule that holds scenes out
+    steps: int | None = None  #: number of steps to predict; None predicts to the end of the shortest video
+    cameras: Sequence[int] | None = None  #: target cameras; None uses those excluded from the training's inputs
+    context: Sequence[int] | None = None  #: input cameras; None spaces them evenly
+    metrics: Sequence[str] | None = None  #: metrics to measure; None measures all whose weights are installed
+    clips: int = 48  #: largest number of clips for FVD
+    trust: bool = False  #: also report how well the calibrated bounds of errors hold
+    calibrate_trust: bool = False  #: calibrate the bounds and write them beside the checkpoint, instead of scoring
+    keep: Sequence[str] = ()  #: see :meth:`gsim3d.train.restore.Restored.open_scene`
+    resample: bool = False  #: see :meth:`gsim3d.train.restore.Restored.open_scene`
+    against: str | None = None  #: report of another model to compare with
+    device: str = "cpu"  #: "cpu" or "cuda"
+    out: str | None = None  #: JSON file; None writes metrics.json next to the checkpoint or predictions
 
 
 def evaluate(job: Job) -> None:

@@ -24,21 +24,14 @@ TIMES = "measured"  # key of measured times in a speeds file, next to the preset
 
 @dataclass(frozen=True)
 class PartTimes:
-    """Measured times of the parts of a reference step: the checkpoint's spec, without CUDA graphs.
+    """Measured times of the parts of a reference step: the checkpoint's spec, without CUDA graphs."""
 
-    Attributes:
-        on: name of the machine.
-        work: workload at which the times were measured.
-        dynamics, gaussians, images: milliseconds of the parts of :func:`gsim3d.effects.plan.predicted_cost`.
-        host: milliseconds in which a GPU waits for the host.
-    """
-
-    on: str
-    work: Workload
-    dynamics: float = 0.0
-    gaussians: float = 0.0
-    images: float = 0.0
-    host: float = 0.0
+    on: str  #: name of the machine
+    work: Workload  #: workload at which the times were measured
+    dynamics: float = 0.0  #: milliseconds of the parts of :func:`gsim3d.effects.plan.predicted_cost`
+    gaussians: float = 0.0  #: milliseconds of the parts of :func:`gsim3d.effects.plan.predicted_cost`
+    images: float = 0.0  #: milliseconds of the parts of :func:`gsim3d.effects.plan.predicted_cost`
+    host: float = 0.0  #: milliseconds in which a GPU waits for the host
 
     def __post_init__(self):
         if not all(type(count) is int and count >= 0 for count in asdict(self.work).values()):

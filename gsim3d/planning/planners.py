@@ -32,17 +32,11 @@ WIDEST = 60.0  # the interval is exp(-WIDEST) to exp(WIDEST) times the spread of
 
 @dataclass(frozen=True)
 class Plan:
-    """A sequence of actions and its predicted cost.
+    """A sequence of actions and its predicted cost."""
 
-    Attributes:
-        actions: [H, A], inside the bounds.
-        cost: predicted cost of ``actions``.
-        history: lowest cost found until the end of each iteration; never rises.
-    """
-
-    actions: Tensor
-    cost: float
-    history: tuple[float, ...]
+    actions: Tensor  #: [H, A], inside the bounds
+    cost: float  #: predicted cost of ``actions``
+    history: tuple[float, ...]  #: lowest cost found until the end of each iteration; never rises
 
 
 class Planner(ABC):

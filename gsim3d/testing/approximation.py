@@ -21,35 +21,23 @@ from gsim3d.state import FROZEN, Particles
 
 @dataclass(frozen=True)
 class SleepError:
-    """Error of sleep at each step.
+    """Error of sleep at each step."""
 
-    Attributes:
-        moved: largest distance of a particle from the rollout without sleep, in metres.
-        psnr: PSNR between the images in dB, inf if equal.
-        log: counts of computed particles.
-    """
-
-    moved: tuple[float, ...]
-    psnr: tuple[float, ...]
-    log: RestLog
+    moved: tuple[float, ...]  #: largest distance of a particle from the rollout without sleep, in metres
+    psnr: tuple[float, ...]  #: PSNR between the images in dB, inf if equal
+    log: RestLog  #: counts of computed particles
 
 
 @dataclass(frozen=True)
 class BackgroundError:
-    """Error of an asymmetric background at each step.
+    """Error of an asymmetric background at each step."""
 
-    Attributes:
-        moved: mean distance of moving particles between the two models, in metres.
-        psnr: PSNR between the images in dB.
-        shadow: mean absolute change of the background's latents in the symmetric model, for example by shadows; 0 in
-            the asymmetric model.
-        shadow_psnr: PSNR in dB between images of the symmetric model with and without these changes.
-    """
-
-    moved: tuple[float, ...]
-    psnr: tuple[float, ...]
+    moved: tuple[float, ...]  #: mean distance of moving particles between the two models, in metres
+    psnr: tuple[float, ...]  #: PSNR between the images in dB
+    #: mean absolute change of the background's latents in the symmetric model, for example by shadows; 0 in the
+    #: asymmetric model
     shadow: tuple[float, ...]
-    shadow_psnr: tuple[float, ...]
+    shadow_psnr: tuple[float, ...]  #: PSNR in dB between images of the symmetric model with and without these changes
 
 
 @torch.no_grad()

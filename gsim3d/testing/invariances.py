@@ -36,19 +36,12 @@ FAR = 2.0**17  # cells, outside the 2^16 cells of a grid
 
 @dataclass(frozen=True)
 class Sample:
-    """Input of a check.
+    """Input of a check."""
 
-    Attributes:
-        frames: input images of one or more scenes.
-        targets: cameras to render; ``image_cloud`` is the scene of each.
-        n_steps: steps of a rollout.
-        plan: what to compute; None: the simulator's default.
-    """
-
-    frames: Frames
-    targets: Cameras
-    n_steps: int = 3
-    plan: Plan | None = None
+    frames: Frames  #: input images of one or more scenes
+    targets: Cameras  #: cameras to render; ``image_cloud`` is the scene of each
+    n_steps: int = 3  #: steps of a rollout
+    plan: Plan | None = None  #: what to compute; None: the simulator's default
 
     @property
     def n_scenes(self) -> int:
@@ -57,19 +50,12 @@ class Sample:
 
 @dataclass(frozen=True)
 class Deviation:
-    """Error of a tensor against its expected value.
+    """Error of a tensor against its expected value."""
 
-    Attributes:
-        what: name of the tensor.
-        error: largest error over the largest expected value; absolute if ``bound`` is 0.
-        bound: largest allowed error; 0: equal bits.
-        where: camera or particle of the largest error.
-    """
-
-    what: str
-    error: float
-    bound: float
-    where: str
+    what: str  #: name of the tensor
+    error: float  #: largest error over the largest expected value; absolute if ``bound`` is 0
+    bound: float  #: largest allowed error; 0: equal bits
+    where: str  #: camera or particle of the largest error
 
     @property
     def holds(self) -> bool:
