@@ -106,7 +106,7 @@ def _section(kind: type, path: str) -> str:
 
 
 def attributes(kind: type) -> dict[str, str]:
-    """Field name -> text, from the section "Attributes" of the docstring of a dataclass."""
+    """Field name -> text, from the section "Attributes" of the docstring of a dataclass, and "#:" at its fields."""
     lines = inspect.getdoc(kind).split("\nAttributes:\n")[-1].splitlines()
     found, names = {}, ()
     for line in lines:
@@ -115,6 +115,11 @@ def attributes(kind: type) -> dict[str, str]:
             found.update(dict.fromkeys(names, entry[2]))
         elif names and line.strip():
             found.update({name: f"{found[name]} {line.strip()}" for name in names})
+    above: list[str] = []
+    for line in inspect.getsource(kind).splitlines():
+        if entry := re.match(r" {4}(\w+): [^#]*(?:#: (.*))?$", line):
+            found |= {entry[1]: text} if (text := entry[2] or " ".join(above)) else {}
+        above = [*above, line.strip()[3:]] if line.strip().startswith("#: ") else []
     return {name: _markdown(text) for name, text in found.items()}
 
 

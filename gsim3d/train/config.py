@@ -23,33 +23,23 @@ Precision = Literal["fp32", "bf16", "fp16"]
 
 @dataclass(frozen=True)
 class PhaseConfig:
-    """A phase of the training. Phases run one after another with the same optimizer state.
+    """A phase of the training. Phases run one after another with the same optimizer state."""
 
-    Attributes:
-        steps: number of optimizer steps.
-        horizon: number of simulated steps after the encoded ones; 0 trains encoder and renderer only. Time and memory
-            grow in proportion.
-        cut: largest number of simulated steps that gradients flow through; longer horizons are simulated in segments
-            without gradients between them. 0: all.
-        history: number of encoded steps; 0: ``data.history``.
-        batch: scenes per optimizer step, over all processes.
-        target_views: target images per step.
-        begin_within: windows start within so many first steps of a scene; 0: anywhere. Bodies at rest teach little.
-        from_start: fraction of the windows, 0 to 1, that start at a scene's first step.
-        learning_rate: peak learning rate of the phase's one-cycle schedule.
-        warm_up: fraction of the phase's steps, 0 to 1, until the peak.
-    """
-
-    steps: int
+    steps: int  #: number of optimizer steps
+    #: number of simulated steps after the encoded ones; 0 trains encoder and renderer only. Time and memory grow in
+    #: proportion.
     horizon: int = 0
+    #: largest number of simulated steps that gradients flow through; longer horizons are simulated in segments without
+    #: gradients between them. 0: all.
     cut: int = 0
-    history: int = 0
-    batch: int = 1
-    target_views: int = 5
+    history: int = 0  #: number of encoded steps; 0: ``data.history``
+    batch: int = 1  #: scenes per optimizer step, over all processes
+    target_views: int = 5  #: target images per step
+    #: windows start within so many first steps of a scene; 0: anywhere. Bodies at rest teach little.
     begin_within: int = 0
-    from_start: float = 0.0
-    learning_rate: float = 2e-4
-    warm_up: float = 0.01
+    from_start: float = 0.0  #: fraction of the windows, 0 to 1, that start at a scene's first step
+    learning_rate: float = 2e-4  #: peak learning rate of the phase's one-cycle schedule
+    warm_up: float = 0.01  #: fraction of the phase's steps, 0 to 1, until the peak
 
     REMOVED: ClassVar[dict] = {"lead": 0, "lit_before": 0, "dynamics_alone": False, "masked_out": 0}
 
@@ -61,51 +51,40 @@ class PhaseConfig:
 
 @dataclass(frozen=True)
 class DataConfig:
-    """Frames and views of a sample.
+    """Frames and views of a sample."""
 
-    Attributes:
-        history: number of encoded steps (T of the paper).
-        shortest_history: if above 0, every optimizer step draws its number of encoded steps from this to ``history``,
-            so that the model supports all of them. A phase's own ``history`` takes precedence.
-        context_views: input images per step.
-        fewest_views: if above 0, every optimizer step draws its number of input images from this to ``context_views``.
-        context_cameras: input cameras; empty: all but ``target_only_cameras``.
-        target_only_cameras: cameras that are never an input, but may be a target.
-        background_stride: every n-th row and column of the pixels of static geometry becomes a particle. Larger values
-            are cheaper and blur the background.
-        body_stride: every n-th row and column of the pixels of movable bodies becomes a particle.
-        unfrozen_background: largest fraction, 0 to 1, of a scene's background that is presented to the dynamics as
-            movable, drawn per scene and in cubes; augmentation for models with an asymmetric background, whose
-            particles at rest may be awake or asleep.
-        position_noise: standard deviation in metres along each axis of a displacement of the movable particles of each
-            encoded step before simulation, smooth in space; training noise that the network learns to correct, as in
-            graph network simulators. Evaluation and the images of the encoded steps have none.
-        resize: (width, height) in pixels: images are resized to cover it and centre-cropped; empty: as recorded.
-        near_far: depth range of all scenes in metres; empty: each scene's own.
-        targets_apart: draw targets only from cameras that are not an input of the window. Otherwise a model can overfit
-            to input views with tiny particles right in front of each camera.
-        unit_cameras: divide lengths by the largest coordinate of a scene's cameras.
-        leave_one_out: targets are the input images, each drawn from the particles of the other cameras; for captures
-            with few cameras. ``target_views`` has no effect.
-        subsample_fps: take every k-th frame of a scene, so that it has this rate; 0: all frames.
-    """
-
-    history: int = 2
+    history: int = 2  #: number of encoded steps (T of the paper)
+    #: if above 0, every optimizer step draws its number of encoded steps from this to ``history``, so that the model
+    #: supports all of them. A phase's own ``history`` takes precedence.
     shortest_history: int = 0
-    context_views: int = 4
+    context_views: int = 4  #: input images per step
+    #: if above 0, every optimizer step draws its number of input images from this to ``context_views``
     fewest_views: int = 0
-    context_cameras: tuple[int, ...] = ()
-    target_only_cameras: tuple[int, ...] = ()
+    context_cameras: tuple[int, ...] = ()  #: input cameras; empty: all but ``target_only_cameras``
+    target_only_cameras: tuple[int, ...] = ()  #: cameras that are never an input, but may be a target
+    #: every n-th row and column of the pixels of static geometry becomes a particle. Larger values are cheaper and blur
+    #: the background.
     background_stride: int = 1
-    body_stride: int = 1
+    body_stride: int = 1  #: every n-th row and column of the pixels of movable bodies becomes a particle
+    #: largest fraction, 0 to 1, of a scene's background that is presented to the dynamics as movable, drawn per scene
+    #: and in cubes; augmentation for models with an asymmetric background, whose particles at rest may be awake or
+    #: asleep
     unfrozen_background: float = 0.0
+    #: standard deviation in metres along each axis of a displacement of the movable particles of each encoded step
+    #: before simulation, smooth in space; training noise that the network learns to correct, as in graph network
+    #: simulators. Evaluation and the images of the encoded steps have none.
     position_noise: float = 0.0
+    #: (width, height) in pixels: images are resized to cover it and centre-cropped; empty: as recorded
     resize: tuple[int, ...] = ()
-    near_far: tuple[float, ...] = ()
+    near_far: tuple[float, ...] = ()  #: depth range of all scenes in metres; empty: each scene's own
+    #: draw targets only from cameras that are not an input of the window. Otherwise a model can overfit to input views
+    #: with tiny particles right in front of each camera.
     targets_apart: bool = False
-    unit_cameras: bool = False
+    unit_cameras: bool = False  #: divide lengths by the largest coordinate of a scene's cameras
+    #: targets are the input images, each drawn from the particles of the other cameras; for captures with few cameras.
+    #: ``target_views`` has no effect.
     leave_one_out: bool = False
-    subsample_fps: float = 0.0
+    subsample_fps: float = 0.0  #: take every k-th frame of a scene, so that it has this rate; 0: all frames
 
     RENAMED: ClassVar[dict] = {"thawed": "unfrozen_background"}
 
@@ -138,22 +117,17 @@ class DataConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights of the loss.
+    """Weights of the loss."""
 
-    Attributes:
-        balance: weight of the first simulated step, 0 to 1; the encoded steps share the rest (lambda of the paper).
-        discount: weight of a simulated step relative to the previous one, 0 to 1 (gamma of the paper).
-        body_weight: weight added to pixels of movable bodies; other pixels have weight 1.
-        perceptual: weight of LPIPS (VGG), added to the squared error; 0.05 in the paper, 0.01 for its rigid bodies.
-            Install its weights with `gsim3d weights lpips`.
-        image_gain: multiply the colour channels of each predicted image by the gains (2/3 to 3/2) that fit its target
-            best, relative to the mean gain of the batch, for cameras that differ in exposure or white balance.
-    """
-
+    #: weight of the first simulated step, 0 to 1; the encoded steps share the rest (lambda of the paper)
     balance: float = 0.5
-    discount: float = 0.87
-    body_weight: float = 0.0
+    discount: float = 0.87  #: weight of a simulated step relative to the previous one, 0 to 1 (gamma of the paper)
+    body_weight: float = 0.0  #: weight added to pixels of movable bodies; other pixels have weight 1
+    #: weight of LPIPS (VGG), added to the squared error; 0.05 in the paper, 0.01 for its rigid bodies. Install its
+    #: weights with `gsim3d weights lpips`.
     perceptual: float = 0.0
+    #: multiply the colour channels of each predicted image by the gains (2/3 to 3/2) that fit its target best, relative
+    #: to the mean gain of the batch, for cameras that differ in exposure or white balance
     image_gain: bool = False
 
     REMOVED: ClassVar[dict] = {"bodies": 0, "shape": 0, "shape_length": ...}
@@ -164,27 +138,18 @@ class LossConfig:
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """AdamW with gradient clipping and weight averaging.
+    """AdamW with gradient clipping and weight averaging."""
 
-    Attributes:
-        beta1: decay of the first moment, below 1.
-        beta2: decay of the second moment, below 1.
-        eps: added to the root of the second moment.
-        weight_decay: decoupled weight decay, multiplied by the learning rate.
-        clip_norm: largest global gradient norm; 0: no clipping.
-        encoder_rate: learning rate of the encoder, relative to the other parts.
-        ema_decay: decay of the exponential moving average of the weights, below 1; 0: no average. Only weights that a
-            step updates are averaged in.
-        max_skipped: number of consecutive steps with a loss or gradient that is not finite, after which training stops.
-    """
-
-    beta1: float = 0.9
-    beta2: float = 0.999
-    eps: float = 1e-8
-    weight_decay: float = 1e-3
-    clip_norm: float = 0.5
-    encoder_rate: float = 1.0
+    beta1: float = 0.9  #: decay of the first moment, below 1
+    beta2: float = 0.999  #: decay of the second moment, below 1
+    eps: float = 1e-8  #: added to the root of the second moment
+    weight_decay: float = 1e-3  #: decoupled weight decay, multiplied by the learning rate
+    clip_norm: float = 0.5  #: largest global gradient norm; 0: no clipping
+    encoder_rate: float = 1.0  #: learning rate of the encoder, relative to the other parts
+    #: decay of the exponential moving average of the weights, below 1; 0: no average. Only weights that a step updates
+    #: are averaged in.
     ema_decay: float = 0.999
+    #: number of consecutive steps with a loss or gradient that is not finite, after which training stops
     max_skipped: int = 20
 
     def __post_init__(self):
@@ -202,18 +167,12 @@ class PrecisionConfig:
 
     Weights, the residual stream, norms, positions, depths, curve codes, splats, losses, sums and the optimizer are
     always float32. "fp16" enables loss scaling, see :class:`gsim3d.train.optimizer.LossScale`.
-
-    Attributes:
-        encoder: precision of the encoder.
-        dynamics: precision of the dynamics.
-        renderer: precision of the renderer's head.
-        perceptual: precision of the convolutions of LPIPS in the loss.
     """
 
-    encoder: Precision = "fp32"
-    dynamics: Precision = "fp32"
-    renderer: Precision = "fp32"
-    perceptual: Precision = "fp32"
+    encoder: Precision = "fp32"  #: precision of the encoder
+    dynamics: Precision = "fp32"  #: precision of the dynamics
+    renderer: Precision = "fp32"  #: precision of the renderer's head
+    perceptual: Precision = "fp32"  #: precision of the convolutions of LPIPS in the loss
 
     @property
     def scales_loss(self) -> bool:
@@ -228,47 +187,35 @@ class PrecisionConfig:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """A training run.
+    """A training run."""
 
-    Attributes:
-        phases: phases, run one after another.
-        preset: model sizes, a function of gsim3d.presets such as ``tiny``.
-        model: overrides of the preset, nested like the model section of a checkpoint's config.yaml.
-        pretrained_depth: .safetensors file of Depth Anything 3 or DINOv2 that a new run with ``backbone: vit_dpt``
-            starts from (:func:`gsim3d.nn.multiview_encoder.depth_weights.load_depth_weights`); empty: none.
-        effects: effects to simulate, see :class:`gsim3d.effects.spec.EffectsSpec`.
-        data: frames and views of a sample.
-        loss: weights of the loss.
-        optimizer: AdamW and weight averaging.
-        precision: "fp32", "bf16" or "fp16" for each part of the model.
-        recompute: activation checkpointing of "encoder", "steps" (each simulated step) or "images"; saves memory with
-            equal results. ``model.dynamics.checkpointing`` additionally checkpoints the blocks within a step.
-        captured: on a GPU, run steps as CUDA graphs (gsim3d.train.captured); faster if kernel launches dominate. Not
-            supported with drop path, shuffled curves or batch normalisation. Results differ by rounding.
-        seed: seed of all randomness, together with the step.
-        workers: number of samples computed in parallel on shares of the CPU threads; results are equal for any number
-            above 0. 0: the samples of a step form one batch, as required by GPUs and batch normalisation.
-        checkpoint_every: steps between checkpoints; the last step is always saved.
-        keep_checkpoints: number of checkpoints to keep.
-        log_every: steps between log entries.
-    """
-
+    #: phases, run one after another
     phases: tuple[PhaseConfig, ...] = (PhaseConfig(steps=1000), PhaseConfig(steps=4000, horizon=12))
-    preset: str = "tiny"
+    preset: str = "tiny"  #: model sizes, a function of gsim3d.presets such as ``tiny``
+    #: overrides of the preset, nested like the model section of a checkpoint's config.yaml
     model: dict = dataclasses.field(default_factory=dict)
+    #: .safetensors file of Depth Anything 3 or DINOv2 that a new run with ``backbone: vit_dpt`` starts from
+    #: (:func:`gsim3d.nn.multiview_encoder.depth_weights.load_depth_weights`); empty: none
     pretrained_depth: str = ""
+    #: effects to simulate, see :class:`gsim3d.effects.spec.EffectsSpec`
     effects: dict = dataclasses.field(default_factory=dict)
-    data: DataConfig = DataConfig()
-    loss: LossConfig = LossConfig()
-    optimizer: OptimizerConfig = OptimizerConfig()
-    precision: PrecisionConfig = PrecisionConfig()
+    data: DataConfig = DataConfig()  #: frames and views of a sample
+    loss: LossConfig = LossConfig()  #: weights of the loss
+    optimizer: OptimizerConfig = OptimizerConfig()  #: AdamW and weight averaging
+    precision: PrecisionConfig = PrecisionConfig()  #: "fp32", "bf16" or "fp16" for each part of the model
+    #: activation checkpointing of "encoder", "steps" (each simulated step) or "images"; saves memory with equal
+    #: results. ``model.dynamics.checkpointing`` additionally checkpoints the blocks within a step.
     recompute: tuple[Literal["encoder", "steps", "images"], ...] = ()
+    #: on a GPU, run steps as CUDA graphs (gsim3d.train.captured); faster if kernel launches dominate. Not supported
+    #: with drop path, shuffled curves or batch normalisation. Results differ by rounding.
     captured: bool = False
-    seed: int = 0
+    seed: int = 0  #: seed of all randomness, together with the step
+    #: number of samples computed in parallel on shares of the CPU threads; results are equal for any number above 0. 0:
+    #: the samples of a step form one batch, as required by GPUs and batch normalisation.
     workers: int = 0
-    checkpoint_every: int = 500
-    keep_checkpoints: int = 2
-    log_every: int = 10
+    checkpoint_every: int = 500  #: steps between checkpoints; the last step is always saved
+    keep_checkpoints: int = 2  #: number of checkpoints to keep
+    log_every: int = 10  #: steps between log entries
 
     RENAMED: ClassVar[dict] = {"stages": "phases"}
     REMOVED: ClassVar[dict] = {"in_turn": [], "rounds": ...}
