@@ -6,29 +6,34 @@ move make a field of their own, which has no time samples.
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from gsim3d.errors import InputError
+from gsim3d.io import usd_child
 from gsim3d.io.arrays import FIELDS, Y_TO_Z_UP, Splats, read_head, turned
 from gsim3d.io.files import whole_file
-
-TYPE = "ParticleField3DGaussianSplat"
 
 
 def _pxr(path: Path):
     try:
-        from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+        from pxr import Sdf, Usd, UsdGeom, Vt
     except ImportError:
         raise InputError(f"{path}: USD needs usd-core 26.3 or newer: pip install 'gsim3d[usd]'") from None
-    return Gf, Sdf, Usd, UsdGeom, Vt
+    return Sdf, Usd, UsdGeom, Vt
 
 
 def write(path: Path, frames: Sequence[Splats], fps: float) -> None:
     """Writes frames without loss, z up, in metres; a single one without time."""
-    _, Sdf, Usd, UsdGeom, Vt = _pxr(path)
+    Sdf, Usd, UsdGeom, Vt = _pxr(path)
     with whole_file(path) as part:
         stage = Usd.Stage.CreateNew(str(part))
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
@@ -41,7 +46,7 @@ def write(path: Path, frames: Sequence[Splats], fps: float) -> None:
             stage.SetStartTimeCode(0)
             stage.SetEndTimeCode(len(frames) - 1)
         for name, chosen in _split(frames):
-            _field(stage.DefinePrim(f"/Gaussians/{name}", TYPE), chosen, Sdf, Vt)
+            _field(stage.DefinePrim(f"/Gaussians/{name}", usd_child.TYPE), chosen, Sdf, Vt)
         stage.GetRootLayer().Save()
         del stage
 
@@ -53,40 +58,33 @@ def read(path: Path) -> Splats:
         InputError: it is no USD file, or has no field of Gaussians.
     """
     read_head(path)  # a regular file
-    try:
-        whole, is_y_up, unit = _read(path)
-    except InputError:
-        raise
-    except (RuntimeError, ValueError, TypeError, AttributeError) as error:  # RuntimeError: pxr's own, too
-        raise InputError(f"{path}: damaged, or not a USD file: {_line(error)}") from None
+    if not find_spec("pxr"):
+        _pxr(path)
+    with TemporaryDirectory() as place:
+        out = Path(place) / "arrays.npz"
+        if status := _child(str(path), str(out)):
+            raise InputError(f"{path}: damaged, or too large: OpenUSD {_ended(status)} while reading it")
+        with np.load(out) as file:
+            found = dict(file)
+    if "error" in found:
+        raise InputError(f"{path}: {found['error']}")
+    unit = found["unit"]
     if not 0 < unit < np.inf:
         raise InputError(f"{path}: metersPerUnit must be positive; got {unit}")
-    if is_y_up:
-        whole = turned(whole, Y_TO_Z_UP)
-    return Splats(whole.means * unit, whole.quats, whole.scales * unit, whole.opacities, whole.sh)
+    means, quats, scales, opacities, sh = (found[name] for name in usd_child.FIELDS)
+    whole = Splats(means * unit, quats, scales * unit, opacities, sh)
+    return turned(whole, Y_TO_Z_UP) if found["is_y_up"] else whole
 
 
-def _read(path: Path) -> tuple[Splats, bool, np.float32]:
-    """The Gaussians as they stand, whether y points up, and metres a unit."""
-    _, _, Usd, UsdGeom, _ = _pxr(path)
-    stage = Usd.Stage.Open(str(path))
-    time = Usd.TimeCode(stage.GetStartTimeCode()) if stage.HasAuthoredTimeCodeRange() else Usd.TimeCode.EarliestTime()
-    parts = [_arrays(path, prim, time) for prim in stage.Traverse() if prim.GetTypeName() == TYPE]
-    if not parts:
-        raise InputError(f"{path}: no prim is a {TYPE}")
-    if len({part.degree for part in parts}) > 1:
-        raise InputError(f"{path}: its fields have different degrees of harmonics")
-    whole = Splats(*(np.concatenate([getattr(part, name) for part in parts]) for name in FIELDS))
-    is_y_up = UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y
-    return whole, is_y_up, np.float32(UsdGeom.GetStageMetersPerUnit(stage))
+def _child(file: str, out: str) -> int:
+    """Runs ``usd_child``; its exit status."""
+    few = dict.fromkeys(("PXR_WORK_THREAD_LIMIT", "OPENBLAS_NUM_THREADS", "MALLOC_ARENA_MAX"), "1")  # address space
+    command = [sys.executable, "-P", usd_child.__file__, file, out]
+    return subprocess.run(command, env={**os.environ, **few}, capture_output=True).returncode
 
 
-def _line(error: Exception) -> str:
-    """The first line of a message; pxr's may hold bytes of the file."""
-    try:
-        return next(iter(str(error).strip().splitlines()), "").rpartition(" : ")[2][:100]
-    except UnicodeDecodeError:
-        return "its text is not UTF-8"
+def _ended(status: int) -> str:
+    return f"was ended by {signal.Signals(-status).name}" if status < 0 else f"ended with code {status}"
 
 
 def _split(frames: Sequence[Splats]) -> list[tuple[str, list[Splats]]]:
@@ -140,24 +138,3 @@ def _extent(splats: Splats) -> np.ndarray:
         return np.zeros((2, 3), np.float32)
     reach = 3 * splats.scales.max(1, keepdims=True)
     return np.stack([(splats.means - reach).min(0), (splats.means + reach).max(0)]).astype(np.float32)
-
-
-def _arrays(path: Path, prim, time) -> Splats:
-    def get(name: str, half: str | None = None):
-        for key in (name, half):
-            attribute = prim.GetAttribute(key) if key else None
-            if attribute and (value := attribute.Get(time)) is not None:
-                return value
-        raise InputError(f"{path}: {prim.GetPath()} lacks {name}")
-
-    means = np.array(get("positions", "positionsh"), np.float32).reshape(-1, 3)
-    turns = get("orientations", "orientationsh")
-    quats = np.array([[q.GetReal(), *q.GetImaginary()] for q in turns], np.float32).reshape(-1, 4)
-    scales = np.array(get("scales", "scalesh"), np.float32).reshape(-1, 3)
-    opacities = np.array(get("opacities", "opacitiesh"), np.float32)
-    flat = np.array(get("radiance:sphericalHarmonicsCoefficients"), np.float32).reshape(-1, 3)
-    n = len(means)
-    fits = n == len(quats) == len(scales) == len(opacities)
-    if not fits or n and (len(flat) % n or len(flat) // n not in (1, 4, 9, 16)):
-        raise InputError(f"{path}: {prim.GetPath()}: its arrays have different counts")
-    return Splats(means, quats, scales, opacities, flat.reshape(n, -1, 3) if n else np.zeros((0, 1, 3), np.float32))

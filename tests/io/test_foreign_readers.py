@@ -116,10 +116,21 @@ def test_damaged_usd_is_refused(tmp_path):
     file = tmp_path / "a.usda"
     write_splats(file, make(3, 1))
     for number, (content, says) in enumerate(damaged(file.read_bytes())):
-        other = tmp_path / f"{number}.usda"  # a stage that is open is not read again
+        other = tmp_path / f"{number}.usda"
         other.write_bytes(content)
         with pytest.raises(InputError, match=says):
             read_splats(other)
     os.mkfifo(tmp_path / "pipe.usda")
     with pytest.raises(InputError, match="not a file"):
         read_splats(tmp_path / "pipe.usda")
+
+
+def test_usd_that_crashes_its_library_is_refused(tmp_path):
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    file = tmp_path / "a.usdc"
+    write_splats(file, make(1, 1))
+    content = bytearray(file.read_bytes())
+    content[25:89] = b"\xff" * 64
+    file.write_bytes(content)
+    with pytest.raises(InputError, match="a.usdc: damaged, .* was ended by SIGSEGV"):
+        read_splats(file)

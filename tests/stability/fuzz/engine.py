@@ -260,7 +260,7 @@ def _child(
     code = "import json, sys; from pathlib import Path; from tests.stability.fuzz import engine; "
     code += "engine.work(json.loads(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3]), float(sys.argv[4]))"
     command = [sys.executable, "-c", code, json.dumps(jobs), str(seed), str(out), str(seconds)]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2", "PXR_WORK_THREAD_LIMIT": "1"}
     with open(out / "log", "wb") as log:
         child = subprocess.Popen(command, cwd=ROOT, env=environment, stderr=log, stdout=log)
     # The libraries take their time to load.

@@ -22,6 +22,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest import mock
 
 import cv2
 import numpy as np
@@ -40,7 +41,17 @@ from gsim3d.evaluate.perceptual import weights
 from gsim3d.evaluate.perceptual.convert import read_onnx
 from gsim3d.evaluate.plan_report import TIMES, load_times
 from gsim3d.evaluate.predictions import Predictions
-from gsim3d.io import checkpoint, read_particles, read_ply, read_splats, write_particles, write_ply, write_splats
+from gsim3d.io import (
+    checkpoint,
+    read_particles,
+    read_ply,
+    read_splats,
+    usd,
+    usd_child,
+    write_particles,
+    write_ply,
+    write_splats,
+)
 from gsim3d.io.files import read_file, read_yaml
 from gsim3d.io.sequence import open_sequence, write_about
 from gsim3d.io.settings import from_dict, to_dict
@@ -233,6 +244,22 @@ def _write_splats(suffix: str, folder: Path) -> None:
 
 def _read_splats(suffix: str, folder: Path, what: str) -> None:
     finite(read_splats(folder / f"a{suffix}"))
+
+
+def _read_usd(suffix: str, folder: Path, what: str) -> None:
+    """Forks where others start a process: at once."""
+
+    def child(file: str, out: str) -> int:
+        if not (pid := os.fork()):
+            try:
+                usd_child.main(file, out)
+                os._exit(0)
+            finally:
+                os._exit(1)
+        return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+
+    with mock.patch.object(usd, "_child", child):
+        _read_splats(suffix, folder, what)
 
 
 def _write_unpacked_spz(folder: Path) -> None:
@@ -473,7 +500,11 @@ READERS = {
         f"splats{suffix}": Reader(
             partial(_write_splats, suffix), partial(_read_splats, suffix), headless=suffix == ".splat"
         )
-        for suffix in (".splat", ".compressed.ply", ".spz", ".glb", *((".usda",) if find_spec("pxr") else ()))
+        for suffix in (".splat", ".compressed.ply", ".spz", ".glb")
+    },
+    **{
+        f"splats{suffix}": Reader(partial(_write_splats, suffix), partial(_read_usd, suffix))
+        for suffix in ((".usda", ".usdc") if find_spec("pxr") else ())
     },
     "spz_unpacked": Reader(_write_unpacked_spz, _read_unpacked_spz),
     **({"spz_4": Reader(_write_spz_4, partial(_read_splats, ".spz"))} if find_spec("zstandard") else {}),
