@@ -1,7 +1,7 @@
 """.usdc and .usda: UsdVol ParticleField3DGaussianSplat, float32; positions and rotations of frames as time samples.
 
-Attributes that never change are written once. Of frames with the same Gaussians in the same order, those that never
-move make a field of their own, which has no time samples.
+Attributes that never change are written once. Frames in a row with as many Gaussians share their fields: one of those
+that never change, without time samples, and one of the others. Fields of other frames are invisible.
 """
 
 from __future__ import annotations
@@ -10,8 +10,9 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
+from itertools import groupby
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -45,8 +46,11 @@ def write(path: Path, frames: Sequence[Splats], fps: float) -> None:
             stage.SetFramesPerSecond(fps)
             stage.SetStartTimeCode(0)
             stage.SetEndTimeCode(len(frames) - 1)
-        for name, chosen in _split(frames):
-            _field(stage.DefinePrim(f"/Gaussians/{name}", usd_child.TYPE), chosen, Sdf, Vt)
+        for begin, span in _spans(frames):
+            for name, chosen in _split(span):
+                prim = stage.DefinePrim(f"/Gaussians/{name}_{begin}", usd_child.TYPE)
+                _field(prim, begin, chosen, Sdf, Vt)
+                _show(UsdGeom.Imageable(prim), begin, begin + len(span), len(frames))
         stage.GetRootLayer().Save()
         del stage
 
@@ -87,14 +91,27 @@ def _ended(status: int) -> str:
     return f"was ended by {signal.Signals(-status).name}" if status < 0 else f"ended with code {status}"
 
 
-def _split(frames: Sequence[Splats]) -> list[tuple[str, list[Splats]]]:
-    """(name, frames) of the parts that are written: what never changes once, what does in every frame."""
-    if len(frames) == 1:
-        return [("all", list(frames))]
-    if len({frame.means.shape + frame.sh.shape for frame in frames}) > 1:
-        return [("moving", list(frames))]
-    first, still = frames[0], np.ones(frames[0].count, bool)
-    for frame in frames[1:]:
+def _spans(frames: Sequence[Splats]) -> Iterator[tuple[int, list[Splats]]]:
+    """(number of the first, frames) of those in a row with as many Gaussians and harmonics."""
+    begin = 0
+    for _, group in groupby(frames, lambda frame: frame.sh.shape):
+        yield begin, (span := list(group))
+        begin += len(span)
+
+
+def _show(field, begin: int, end: int, count: int) -> None:
+    """Makes a field of ``count`` frames visible from ``begin`` to before ``end``."""
+    shown = {0: begin == 0, begin: True, end: False}
+    if end - begin < count:
+        for time, is_shown in shown.items():
+            if time < count:
+                field.CreateVisibilityAttr().Set("inherited" if is_shown else "invisible", time)
+
+
+def _split(span: list[Splats]) -> Iterator[tuple[str, list[Splats]]]:
+    """(name, frames) of the parts of a span: what never changes once, what does in every frame."""
+    first, still = span[0], np.ones(span[0].count, bool)
+    for frame in span[1:]:
         for name in FIELDS:
             now, before = (getattr(one, name).reshape(first.count, -1) for one in (frame, first))
             still &= (now == before).all(1)
@@ -102,11 +119,13 @@ def _split(frames: Sequence[Splats]) -> list[tuple[str, list[Splats]]]:
     def some(frame: Splats, chosen: np.ndarray) -> Splats:
         return Splats(*(getattr(frame, name)[chosen] for name in FIELDS))
 
-    parts = [("still", [some(first, still)])] if still.any() else []
-    return parts + ([("moving", [some(frame, ~still) for frame in frames])] if not still.all() else [])
+    if still.any() or not len(still):
+        yield "still", [some(first, still)]
+    if not still.all():
+        yield "moving", [some(frame, ~still) for frame in span]
 
 
-def _field(prim, frames: Sequence[Splats], Sdf, Vt) -> None:
+def _field(prim, begin: int, frames: Sequence[Splats], Sdf, Vt) -> None:
     types = Sdf.ValueTypeNames
     attributes = {
         "positions": (types.Point3fArray, Vt.Vec3fArray, lambda s: s.means),
@@ -128,7 +147,7 @@ def _field(prim, frames: Sequence[Splats], Sdf, Vt) -> None:
             continue
         for time, array in enumerate(arrays):
             if before is None or array != before or time + 1 < len(arrays) and arrays[time + 1] != array:
-                attribute.Set(array, time)  # both ends of what stays: readers interpolate between samples
+                attribute.Set(array, begin + time)  # both ends of what stays: readers interpolate between samples
             before = array
 
 

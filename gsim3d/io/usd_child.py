@@ -43,9 +43,10 @@ def read(file: str) -> dict[str, np.ndarray]:
 
     stage = Usd.Stage.Open(file)
     time = Usd.TimeCode(stage.GetStartTimeCode()) if stage.HasAuthoredTimeCodeRange() else Usd.TimeCode.EarliestTime()
-    parts = [_arrays(prim, time) for prim in stage.Traverse() if prim.GetTypeName() == TYPE]
+    fields = [prim for prim in stage.Traverse() if prim.GetTypeName() == TYPE]
+    parts = [_arrays(prim, time) for prim in fields if UsdGeom.Imageable(prim).ComputeVisibility(time) != "invisible"]
     if not parts:
-        raise Refused(f"no prim is a {TYPE}")
+        raise Refused(f"no visible prim is a {TYPE}")
     if len({part[-1].shape[1:] for part in parts}) > 1:
         raise Refused("its fields have different degrees of harmonics")
     found = {name: np.concatenate(arrays) for name, arrays in zip(FIELDS, zip(*parts))}

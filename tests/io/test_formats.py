@@ -312,11 +312,11 @@ def test_usd_stores_static_gaussians_once(tmp_path):
     assert stage.GetTimeCodesPerSecond() == 42 and stage.GetEndTimeCode() == 3
     prims = {prim.GetName(): prim for prim in stage.Traverse() if prim.GetTypeName().startswith("Particle")}
     positions = {name: prim.GetAttribute("positions") for name, prim in prims.items()}
-    assert not positions["still"].GetTimeSamples() and len(positions["still"].Get()) == 40
-    assert positions["moving"].GetTimeSamples() == [0, 1, 2, 3]
+    assert not positions["still_0"].GetTimeSamples() and len(positions["still_0"].Get()) == 40
+    assert positions["moving_0"].GetTimeSamples() == [0, 1, 2, 3]
     for step, frame in enumerate(frames):
-        assert np.array_equal(np.array(positions["moving"].Get(step)), frame.means[:20].numpy())
-    assert not prims["moving"].GetAttribute("opacities").GetTimeSamples()
+        assert np.array_equal(np.array(positions["moving_0"].Get(step)), frame.means[:20].numpy())
+    assert not prims["moving_0"].GetAttribute("opacities").GetTimeSamples()
 
 
 def test_sequence_reads_its_rate(tmp_path):
