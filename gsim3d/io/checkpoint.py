@@ -12,8 +12,6 @@ checkpoint folder holds
 Nothing here is a pickle: reading a checkpoint runs no code.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -72,21 +70,15 @@ _STATE_VALUES = {
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What a checkpoint holds.
+    """What a checkpoint holds."""
 
-    Attributes:
-        model, ema, optimizer: tensors by name; ema and optimizer may be empty.
-        config: the content of config.yaml: format, model, data, effects, train.
-        state: step, next_sample, and what else resuming needs; plain JSON values.
-        digest: hash that names this checkpoint; None before it is written.
-    """
-
-    model: dict[str, Tensor]
-    config: dict[str, Any]
+    model: dict[str, Tensor]  #: tensors by name; ema and optimizer may be empty
+    config: dict[str, Any]  #: the content of config.yaml: format, model, data, effects, train
+    #: step, next_sample, and what else resuming needs; plain JSON values
     state: dict[str, Any] = field(default_factory=dict)
-    ema: dict[str, Tensor] = field(default_factory=dict)
-    optimizer: dict[str, Tensor] = field(default_factory=dict)
-    digest: str | None = None
+    ema: dict[str, Tensor] = field(default_factory=dict)  #: tensors by name; ema and optimizer may be empty
+    optimizer: dict[str, Tensor] = field(default_factory=dict)  #: tensors by name; ema and optimizer may be empty
+    digest: str | None = None  #: hash that names this checkpoint; None before it is written
 
     @property
     def weights(self) -> dict[str, Tensor]:

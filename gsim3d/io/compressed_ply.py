@@ -4,8 +4,6 @@ Positions and log-scales in 11, 10 and 11 bits, rotations as the three smaller c
 opacity in 8 bits, harmonics above degree 0 in 8 bits between -4 and 4.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from pathlib import Path

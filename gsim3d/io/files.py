@@ -1,7 +1,5 @@
 """Files of unknown origin, read with bounded memory; and new files, which appear whole or not at all."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import reprlib

@@ -18,25 +18,15 @@ UPS = ("y", "z")
 
 @dataclass(frozen=True)
 class Format:
-    """One format of Gaussians.
+    """One format of Gaussians."""
 
-    Attributes:
-        about: one line of what it keeps.
-        write: writes one frame; frames and their rate where ``has_time``.
-        read: reads the (first) frame; None: it is not read.
-        up: axis that points up in a file, unless it is said otherwise; None: the file says it itself.
-        most_degree: of spherical harmonics that it keeps.
-        says_antialiased: whether it keeps ``antialiased``.
-        has_time: whether one file holds a sequence.
-    """
-
-    about: str
-    write: Callable
-    read: Callable[[Path], Splats] | None
-    up: str | None = "z"
-    most_degree: int = 3
-    says_antialiased: bool = False
-    has_time: bool = False
+    about: str  #: one line of what it keeps
+    write: Callable  #: writes one frame; frames and their rate where ``has_time``
+    read: Callable[[Path], Splats] | None  #: reads the (first) frame; None: it is not read
+    up: str | None = "z"  #: axis that points up in a file, unless it is said otherwise; None: the file says it itself
+    most_degree: int = 3  #: of spherical harmonics that it keeps
+    says_antialiased: bool = False  #: whether it keeps ``antialiased``
+    has_time: bool = False  #: whether one file holds a sequence
 
 
 FORMATS = {

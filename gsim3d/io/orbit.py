@@ -1,7 +1,5 @@
 """A video of Gaussians from a camera that circles around them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 

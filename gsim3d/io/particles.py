@@ -1,7 +1,5 @@
 """The last steps of a scene as one .safetensors file: a state that a simulation goes on from."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from itertools import pairwise

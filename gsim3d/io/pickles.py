@@ -1,7 +1,5 @@
 """What a pickle would make, looked at before anything of it is made."""
 
-from __future__ import annotations
-
 import pickletools
 
 MAX_OPS = 2 * 10**6  # of a pickle; the index of a model with a hundred thousand tensors has fewer

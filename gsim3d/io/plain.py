@@ -1,7 +1,5 @@
 """Plain values from untrusted YAML and JSON text, in bounded time and memory."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -26,34 +26,22 @@ _ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 @dataclass
 class Element:
-    """One element of a header.
+    """One element of a header."""
 
-    Attributes:
-        name: as the header has it.
-        count: rows.
-        properties: of each its name, the dtype of its length (None: a single number) and the dtype of its numbers.
-    """
-
-    name: str
-    count: int
+    name: str  #: as the header has it
+    count: int  #: rows
+    #: of each its name, the dtype of its length (None: a single number) and the dtype of its numbers
     properties: list[tuple[str, str | None, str]] = field(default_factory=list)
 
 
 @dataclass
 class Header:
-    """The header of a file.
+    """The header of a file."""
 
-    Attributes:
-        encoding: a key of _ORDERS.
-        elements: in the order of the body.
-        comments: also those of obj_info.
-        end: bytes before the body.
-    """
-
-    encoding: str
-    elements: list[Element]
-    comments: list[str]
-    end: int
+    encoding: str  #: a key of _ORDERS
+    elements: list[Element]  #: in the order of the body
+    comments: list[str]  #: also those of obj_info
+    end: int  #: bytes before the body
 
     @property
     def is_mip(self) -> bool:

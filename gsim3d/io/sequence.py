@@ -1,7 +1,5 @@
 """A sequence of Gaussians on disk: a folder of one file a frame, with its rate beside it."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import dataclass
@@ -18,17 +16,11 @@ GAUSSIANS = "gaussians"  # folder of a run
 
 @dataclass(frozen=True)
 class Sequence:
-    """Frames of Gaussians, read when they are asked for.
+    """Frames of Gaussians, read when they are asked for."""
 
-    Attributes:
-        files: one a frame, in the order of their names.
-        fps: frames a second; None: the folder does not say.
-        up: axis that points up in the files; None: as their format does.
-    """
-
-    files: tuple[Path, ...]
-    fps: float | None = None
-    up: str | None = None
+    files: tuple[Path, ...]  #: one a frame, in the order of their names
+    fps: float | None = None  #: frames a second; None: the folder does not say
+    up: str | None = None  #: axis that points up in the files; None: as their format does
 
     def __len__(self) -> int:
         return len(self.files)

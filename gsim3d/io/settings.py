@@ -1,7 +1,5 @@
 """Nested dataclasses from plain data and back: typed, naming every key that is unknown, missing or of a wrong type."""
 
-from __future__ import annotations
-
 import dataclasses
 import types
 import typing

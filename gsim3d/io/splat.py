@@ -4,8 +4,6 @@ float32 position and scale, uint8 colour and opacity, uint8 quaternion (w, x, y,
 volume times opacity, so that a prefix of the file is a preview.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

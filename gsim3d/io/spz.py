@@ -4,8 +4,6 @@ Positions in fixed point of 24 bits (12 of them fractional: 0.12 mm), log-scales
 8 bits, rotations as the three smaller components in 10 bits, harmonics in 5 (degree 1) or 4 bits.
 """
 
-from __future__ import annotations
-
 import gzip
 import struct
 import zlib

@@ -1,7 +1,5 @@
 """Text that is safe on a terminal, and progress with the time left."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Callable

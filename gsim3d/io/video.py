@@ -1,7 +1,5 @@
 """Video files that browsers and phones play: H.264 in MP4 where PyAV is installed, VP9 in MP4 otherwise."""
 
-from __future__ import annotations
-
 import errno
 import math
 from collections.abc import Iterable, Iterator

@@ -1,7 +1,5 @@
 """What ``gsim3d export --scene`` does: a film or player with the truth beside what was predicted."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

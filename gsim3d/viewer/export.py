@@ -1,7 +1,5 @@
 """What ``gsim3d export`` does: Gaussians of a file or folder in a format that other tools open, or as a video."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Frames of films: labelled panels of a size that screens like."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 
 import cv2

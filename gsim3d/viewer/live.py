@@ -1,7 +1,5 @@
 """What the live viewer shows: a target, the frame of a timeline, layers and colours. Independent of the browser."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import warnings
@@ -96,23 +94,14 @@ class Timeline:
 
 @dataclass(frozen=True)
 class Layers:
-    """What is drawn.
+    """What is drawn."""
 
-    Attributes:
-        moving: particles that may move.
-        frozen: particles of the static background.
-        cameras: cameras of the scene, with their images.
-        truth: true image beside the predicted one.
-        coloring: one of COLORINGS.
-        size: of the drawn Gaussians, relative to their own: small ones show single particles.
-    """
-
-    moving: bool = True
-    frozen: bool = True
-    cameras: bool = True
-    truth: bool = True
-    coloring: str = COLORINGS[0]
-    size: float = 1.0
+    moving: bool = True  #: particles that may move
+    frozen: bool = True  #: particles of the static background
+    cameras: bool = True  #: cameras of the scene, with their images
+    truth: bool = True  #: true image beside the predicted one
+    coloring: str = COLORINGS[0]  #: one of COLORINGS
+    size: float = 1.0  #: of the drawn Gaussians, relative to their own: small ones show single particles
 
     def __post_init__(self):
         if self.coloring not in COLORINGS:
@@ -126,23 +115,14 @@ class Layers:
 
 @dataclass(frozen=True)
 class View:
-    """A camera and what it recorded.
+    """A camera and what it recorded."""
 
-    Attributes:
-        name: of the camera.
-        quat: [4] (w, x, y, z), from the camera's axes (x right, y down, z forward) to those of the scene.
-        position: [3] metres.
-        fov: vertical angle, radians.
-        aspect: width over height.
-        image: uint8 [H, W, 3]; None beyond the end of the recording.
-    """
-
-    name: str
-    quat: np.ndarray
-    position: np.ndarray
-    fov: float
-    aspect: float
-    image: np.ndarray | None
+    name: str  #: of the camera
+    quat: np.ndarray  #: [4] (w, x, y, z), from the camera's axes (x right, y down, z forward) to those of the scene
+    position: np.ndarray  #: [3] metres
+    fov: float  #: vertical angle, radians
+    aspect: float  #: width over height
+    image: np.ndarray | None  #: uint8 [H, W, 3]; None beyond the end of the recording
 
 
 class Target:

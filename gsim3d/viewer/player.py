@@ -5,8 +5,6 @@ to the steps below. What never changes is stored once; else the second differenc
 (others), as unsigned zigzag numbers, low and high bytes apart, deflated.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import zlib
@@ -36,18 +34,12 @@ MOST_IMAGES = 2**27  # bytes of encoded images
 
 @dataclass(frozen=True)
 class View:
-    """A camera of the first look at a scene.
+    """A camera of the first look at a scene."""
 
-    Attributes:
-        viewmat: [4, 4] world to camera, x right, y down, z forward.
-        K: [3, 3] pixels.
-        width, height: of its images.
-    """
-
-    viewmat: np.ndarray
-    K: np.ndarray
-    width: int
-    height: int
+    viewmat: np.ndarray  #: [4, 4] world to camera, x right, y down, z forward
+    K: np.ndarray  #: [3, 3] pixels
+    width: int  #: of its images
+    height: int  #: of its images
 
 
 def write_player(

@@ -1,7 +1,5 @@
 """A scene that a simulator predicts while it is looked at: edits, bodies, and effects with their measured costs."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
@@ -38,38 +36,23 @@ Box = tuple[Sequence[float], Sequence[float]]
 
 @dataclass(frozen=True)
 class Part:
-    """Steps that were predicted in one go.
+    """Steps that were predicted in one go."""
 
-    Attributes:
-        first: of them, counted from the first predicted one of all.
-        edits: made right before it.
-        history: steps before it as the model saw them, after the edits.
-        steps: predicted particles.
-        plan: by which they were predicted.
-    """
-
-    first: int
-    edits: tuple[Edit, ...]
-    history: Particles
-    steps: list[Particles]
-    plan: Plan
+    first: int  #: of them, counted from the first predicted one of all
+    edits: tuple[Edit, ...]  #: made right before it
+    history: Particles  #: steps before it as the model saw them, after the edits
+    steps: list[Particles]  #: predicted particles
+    plan: Plan  #: by which they were predicted
 
 
 @dataclass(frozen=True)
 class Switch:
-    """An effect of the plan.
+    """An effect of the plan."""
 
-    Attributes:
-        name: as ``gsim3d plan`` has it.
-        now: the setting that is chosen.
-        settings: setting -> effects with it; one alone where there is no choice.
-        why: why other settings are not possible with this model; empty: all are.
-    """
-
-    name: str
-    now: str
-    settings: dict[str, EffectsSpec]
-    why: str = ""
+    name: str  #: as ``gsim3d plan`` has it
+    now: str  #: the setting that is chosen
+    settings: dict[str, EffectsSpec]  #: setting -> effects with it; one alone where there is no choice
+    why: str = ""  #: why other settings are not possible with this model; empty: all are
 
 
 class Simulation:

@@ -1,7 +1,5 @@
 """What the live viewer opens without a simulator: files of Gaussians and recorded scenes."""
 
-from __future__ import annotations
-
 import dataclasses
 import warnings
 from dataclasses import dataclass

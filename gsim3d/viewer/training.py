@@ -1,7 +1,5 @@
 """A viewer of a training run: the newest sample prediction, uploaded by the viewer's own thread."""
 
-from __future__ import annotations
-
 import dataclasses
 import warnings
 from collections.abc import Callable, Iterator
