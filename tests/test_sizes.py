@@ -13,7 +13,7 @@ SPEC.loader.exec_module(sizes)
 TODAY = {
     "lines of the package": 47_429,
     "lines of the library without io": 17_376,
-    "lines of readers, writers and the viewer": 4_591,
+    "lines of readers, writers and the viewer": 4_553,
 }
 
 

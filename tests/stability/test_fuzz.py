@@ -16,6 +16,7 @@ from tests.stability.fuzz.readers import READERS
 FEW, PER_OP = 25, 2000  # inputs of each op in the fast tests, and in the full ones
 FEW_FILES, PER_READER = 4, 2000  # damaged files of each reader: few, and many
 READER_SECONDS, LEAST_FILES = 10, 5  # no further file after so long; so many are read on a busy machine, too
+SPLATS = sorted(name for name in READERS if name.startswith(("ply", "splats", "spz")))
 ENOUGH = 200  # inputs that are answered in several ways
 FEW_COMMANDS, PER_COMMAND = 4, 200  # wrong arguments of each command: few, and many
 
@@ -60,9 +61,15 @@ def test_readers_answer_a_few_files(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("half", [0, 1])
+def test_readers_of_splats_answer_all_files(half, tmp_path):
+    assert_all_answered(run(SPLATS[half::2], PER_READER, out=tmp_path), PER_READER)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("quarter", range(4))
 def test_readers_answer_thousands_of_files(quarter, tmp_path):
-    names = sorted(READERS)[quarter::4]
+    names = sorted(set(READERS) - set(SPLATS))[quarter::4]
     outcomes = run(names, PER_READER, out=tmp_path, seconds=READER_SECONDS)
     assert_all_answered(outcomes, PER_READER, LEAST_FILES)
 
