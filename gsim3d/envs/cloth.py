@@ -1,6 +1,5 @@
 """ClothCover: two grippers hold a cloth at two of its corners and lay it over a round region."""
 
-import os
 from functools import cache
 
 import numpy as np
@@ -10,9 +9,9 @@ from torch import Tensor
 from gsim3d.envs.scenes import FPS, N_PARTICLES, Scenes, TrueScene
 from gsim3d.envs.tasks import TaskEnv, TaskVectorEnv
 from gsim3d.synth.embedding import ClothGrid, grid_faces
-from gsim3d.synth.mujoco_engine import CLOTH_RADIUS, CONTACT_TIME, POISSON
+from gsim3d.synth.mujoco_engine import CLOTH_RADIUS, CONTACT_TIME, POISSON, check_solver, load_mujoco
+from gsim3d.synth.pushing import balls
 from gsim3d.synth.render import Surface
-from gsim3d.synth.scene_setup import Unstable
 from gsim3d.synth.shapes import icosphere
 from gsim3d.synth.world import CLOTH_COLOR, CLOTH_REFINEMENT
 
@@ -43,17 +42,16 @@ class ClothScene(TrueScene):
     grip = 1.5 * GRIPPER_RADIUS
 
     def __init__(self, angle: float, goal: np.ndarray):
-        points, faces = icosphere(1)
-        gripper = Surface(faces, points[faces], lambda p: np.broadcast_to(GRIPPER_COLOR, p.shape))
+        gripper = balls(1, GRIPPER_COLOR)
         flat = ClothGrid(np.zeros((1, COUNT, COUNT, 3)))
-        self._fine, self._sphere = flat.refine(CLOTH_REFINEMENT), GRIPPER_RADIUS * points
+        self._fine, self._sphere = flat.refine(CLOTH_REFINEMENT), GRIPPER_RADIUS * icosphere(1)[0]
         faces = grid_faces((COUNT - 1) * CLOTH_REFINEMENT + 1)
         corners = np.zeros((*faces.shape, 3))
         sheet = Surface(faces, corners, lambda p: np.broadcast_to(CLOTH_COLOR, p.shape), two_sided=True)
         super().__init__(goal, [sheet, gripper, gripper], 1)
         self._model, self._data = _start(angle)
         self._data.qpos[:] = _settled()
-        _mujoco().mj_forward(self._model, self._data)
+        load_mujoco().mj_forward(self._model, self._data)
 
     @property
     def actors(self) -> np.ndarray:
@@ -76,17 +74,9 @@ class ClothScene(TrueScene):
         _advance(self._model, self._data, velocities / FPS)
 
 
-def _mujoco():
-    os.environ.setdefault("MUJOCO_GL", "disable")
-    import mujoco
-
-    mujoco.set_mju_user_warning(lambda text: None)  # the default writes a log file to the working directory
-    return mujoco
-
-
 def _start(angle: float):
     """Model and data of a flat cloth at the height HELD, turned by ``angle``."""
-    mujoco = _mujoco()
+    mujoco = load_mujoco()
     c, s, half = np.cos(angle), np.sin(angle), WIDTH / 2
     grippers = "".join(
         f'<body name="g{i}" mocap="true" pos="{-half * c - side * s:.9g} {-half * s + side * c:.9g} {HELD}"/>'
@@ -118,11 +108,10 @@ def _advance(model, data, moved: np.ndarray) -> None:
     start = data.mocap_pos.copy()
     for substep in range(1, SUBSTEPS + 1):
         data.mocap_pos[:] = start + substep / SUBSTEPS * moved
-        _mujoco().mj_step(model, data)
-    _mujoco().mj_kinematics(model, data)
-    _mujoco().mj_flex(model, data)
-    if any(warning.number for warning in data.warning) or not np.isfinite(data.qpos).all():
-        raise Unstable("the solver gave up")
+        load_mujoco().mj_step(model, data)
+    load_mujoco().mj_kinematics(model, data)
+    load_mujoco().mj_flex(model, data)
+    check_solver(data)
 
 
 @cache

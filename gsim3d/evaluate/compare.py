@@ -101,14 +101,9 @@ def _compare(ours: dict, other: dict, where: str) -> dict:
             raise InputError(f"{where}: images, labels or target cameras of {scene} differ between the reports")
     found = {}
     for score in (f"{part}.{metric}" for part in PARTS for metric in METRICS):
-        pairs = [
-            (a, b)
-            for scene in known
-            for a, b in [(_score(ours, scene, score), _score(other, scene, score))]
-            if a is not None and b is not None
-        ]
-        if pairs:
-            found[score] = _difference([a - b for a, b in pairs], METRICS[score.split(".")[-1]].rises)
+        both = ((_score(ours, scene, score), _score(other, scene, score)) for scene in known)
+        if differences := [a - b for a, b in both if a is not None and b is not None]:
+            found[score] = _difference(differences, METRICS[score.split(".")[-1]].rises)
     return found
 
 

@@ -185,15 +185,12 @@ def _pictures(out: Path, predictor: _Predictor, scenes: list, summary: dict) -> 
 
 def comparisons(summary: dict) -> list[tuple[str, float, float]]:
     """Returns (description, model, baseline) of three comparisons with baselines; PSNR in dB."""
-    return [
-        ("PSNR of predicted steps, against constant", summary["future.psnr"], summary["constant.future.psnr"]),
-        ("the same, masked", summary["future.psnr_masked"], summary["constant.future.psnr_masked"]),
-        (
-            "masked, second half of the horizon, against copy",
-            summary["future_late.psnr_masked"],
-            summary["copy.future_late.psnr_masked"],
-        ),
-    ]
+    rows = {
+        "PSNR of predicted steps, against constant": ("future.psnr", "constant"),
+        "the same, masked": ("future.psnr_masked", "constant"),
+        "masked, second half of the horizon, against copy": ("future_late.psnr_masked", "copy"),
+    }
+    return [(what, summary[score], summary[f"{baseline}.{score}"]) for what, (score, baseline) in rows.items()]
 
 
 def _report(out: Path, summary: dict, seconds: dict, now: float) -> None:

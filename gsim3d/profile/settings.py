@@ -147,27 +147,28 @@ def _histories(case: BenchmarkCase) -> list[Setting]:
     return [Setting(history=n) for n in POWERS if n < trained]
 
 
-def _backgrounds(case: BenchmarkCase) -> list[Setting]:
-    trained = case.restored.plan.spec.dynamics.background
-    return [] if trained == "masked_out" else [Setting(background="masked_out")]
-
-
 def _patches(case: BenchmarkCase) -> list[Setting]:
     dynamics = case.restored.simulator.config.dynamics
     largest = max(dynamics.patch_sizes) if dynamics.graph is None else 0
     return [Setting(patch_size=n) for n in reversed([n for n in POWERS if 32 <= n < largest][-3:])]
 
 
-def _views(case: BenchmarkCase) -> list[Setting]:
-    return [Setting(context_views=n) for n in range(1, case.restored.data.context_views)]
-
-
 GROUPS = (
     Group("precision", "model", _precisions, "a GPU: on a CPU there is only float32", few=3),
     Group("graph capture", "exact", lambda case: [Setting(captured=True)] * (case.device.type == "cuda"), "a GPU"),
-    Group("context views", "model", _views, "more than one context view"),
+    Group(
+        "context views",
+        "model",
+        lambda case: [Setting(context_views=n) for n in range(1, case.restored.data.context_views)],
+        "more than one context view",
+    ),
     Group("history", "model", _histories, "a model of more than one step of history"),
-    Group("background", "model", _backgrounds, "background particles"),
+    Group(
+        "background",
+        "model",
+        lambda case: [Setting(background="masked_out")] * (case.restored.plan.spec.dynamics.background != "masked_out"),
+        "background particles",
+    ),
     Group("particles kept", "model", lambda case: [Setting(kept=share) for share in (0.75, 0.5, 0.25, 0.1)]),
     Group(
         "degree of colours",

@@ -436,8 +436,12 @@ class Sweep:
             random.Random(n).shuffle(order)
             for point in order:
                 self.progress(f"timing, round {n + 1}: {point.setting.name}")
-                if not point.failure and len(point.step) <= n:
-                    self._time(point)
+                if point.failure or len(point.step) > n:
+                    continue
+                try:
+                    point.step += (self._timing(point),)
+                except (torch.OutOfMemoryError, CaptureError, InputError) as error:
+                    point.failure = f"timing: {reason(error)}"
             self._time_inputs([point for point in points if not point.failure and len(point.encode) <= n])
             self._save()
 
@@ -451,15 +455,6 @@ class Sweep:
             for point in points:
                 if point.setting.of_input == given:
                     point.encode += (timing,)
-
-    def _time(self, point: Point) -> None:
-        """Times one round of ``point``, or sets its ``failure``."""
-        try:
-            timing = self._timing(point)
-        except (torch.OutOfMemoryError, CaptureError, InputError) as error:
-            point.failure = f"timing: {reason(error)}"
-        else:
-            point.step += (timing,)
 
     def _timing(self, point: Point) -> Timing:
         case, setting, effort = self.case, point.setting, self.effort

@@ -83,10 +83,10 @@ def to_json(scores: SceneScores, n_given: int) -> dict:
 def from_json(content: dict, method: str = "model") -> SceneScores:
     """Converts the result of :func:`to_json` to scores that have ``method`` alone, as their model."""
     values = {metric: _tensor(v) for metric, v in content["values"][method].items()}
-    physics = {kept: content["physics"][name] for kept, name in (("model", method), ("truth", "truth"))
-               if name in content["physics"]}  # fmt: skip
-    clips = {kept: content["clips"][name] for kept, name in (("model", method), ("truth", "truth"))
-             if name in content["clips"]}  # fmt: skip
+    physics, clips = (
+        {kept: content[part][name] for kept, name in (("model", method), ("truth", "truth")) if name in content[part]}
+        for part in ("physics", "clips")
+    )
     return SceneScores(
         **{
             **content,

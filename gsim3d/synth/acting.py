@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsim3d.errors import InputError
 from gsim3d.synth import pushing, scene_setup
 from gsim3d.synth.embedding import ParticleCloud, RigidFrame
 from gsim3d.synth.scene_setup import Pusher, Unstable
@@ -96,9 +95,7 @@ class Push(World):
 
     def check(self) -> None:
         super().check()
-        low, high = self.push_speed
-        if not 0 < low <= high < np.inf:
-            raise InputError(f"push_speed must be two positive numbers, the smaller first; got {low} {high}")
+        self._check_ranges("push_speed")
 
     def _draw(self, name, rng):
         count, known = int(rng.integers(self.n_bodies[0], self.n_bodies[1] + 1)), self.object_names()

@@ -8,7 +8,7 @@ import numpy as np
 
 from gsim3d.synth import render
 from gsim3d.synth.bodies import load_mesh, mesh_name, name_rng, named_body
-from gsim3d.synth.scene_setup import GRAVITY, Cloth, RigidBody, SoftBody
+from gsim3d.synth.scene_setup import GRAVITY, Cloth, RigidBody, SoftBody, turn_about_z
 from gsim3d.synth.world import SceneBody, World
 
 GAP = 0.03  # smallest initial distance between the bounding spheres of two bodies in metres
@@ -40,7 +40,7 @@ class FallingWorld(World):
         else:
             body = load_mesh(path, self.mesh_up)
         # Mesh files stay upright and rotate about the z axis; other bodies have a random orientation.
-        rotation = _random_rotation(rng) if path is None else _turn(rng.uniform(0, 2 * np.pi))
+        rotation = _random_rotation(rng) if path is None else turn_about_z(rng.uniform(0, 2 * np.pi))
         size = rng.uniform(*self.body_size)
         vertices = size * (body.vertices[:, None, :] * rotation).sum(-1)
         collision = size * (body.collision_vertices[:, None, :] * rotation).sum(-1)
@@ -93,11 +93,6 @@ def _clear_of(position: np.ndarray, radius: float, before: list[SceneBody]) -> n
         if aside < reach**2 and abs(position[2] - centre[2]) ** 2 + aside < reach**2:
             position[2] = centre[2] + np.sqrt(reach**2 - aside)
     return position
-
-
-def _turn(angle: float) -> np.ndarray:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
 
 def _random_rotation(rng: np.random.Generator) -> np.ndarray:

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsim3d.errors import InputError
-from gsim3d.synth import mujoco_engine, render, scene_setup
+from gsim3d.synth import mujoco_engine, pushing, scene_setup
 from gsim3d.synth.acting import RESTING, smooth_path
 from gsim3d.synth.embedding import ClothGrid, ParticleCloud
 from gsim3d.synth.scene_setup import Cloth, SceneSetup, Unstable
@@ -51,10 +50,7 @@ class ClothGrip(World):
     def check(self) -> None:
         super().check()
         self._check_counts(cloth_count=3)
-        for field in ("cloth_width", "cloth_mass", "cloth_young", "grip_speed"):
-            low, high = getattr(self, field)
-            if not 0 < low <= high < np.inf:
-                raise InputError(f"{field} must be two positive numbers, the smaller first; got {low} {high}")
+        self._check_ranges("cloth_width", "cloth_mass", "cloth_young", "grip_speed")
 
     def _draw(self, name, rng):
         n = self.cloth_count
@@ -64,12 +60,8 @@ class ClothGrip(World):
         return 0.0, Cloth(width, height, n, mass, young, thickness=0.008, damping=0.015, held=held), []
 
     def _with_actors(self, drawn: SceneDraw, rng: np.random.Generator) -> SceneDraw:
-        points, faces = icosphere(1)
-        n_grips = len(drawn.cloth.held)
-        faces = np.concatenate([faces + len(points) * number for number in range(n_grips)])
-        corners = np.tile(points, (n_grips, 1))[faces]
-        surface = render.Surface(faces, corners, lambda p: np.broadcast_to(COLOR, p.shape))
-        return dataclasses.replace(drawn, surfaces=[*drawn.surfaces, surface], policy=self._path(drawn.cloth, rng))
+        surfaces = [*drawn.surfaces, pushing.balls(len(drawn.cloth.held), COLOR)]
+        return dataclasses.replace(drawn, surfaces=surfaces, policy=self._path(drawn.cloth, rng))
 
     def _path(self, cloth: Cloth, rng: np.random.Generator) -> np.ndarray:
         """Draws the positions of the grippers [SETTLE fps + T, G, 3]; the first ones are those of their nodes."""

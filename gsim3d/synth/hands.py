@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsim3d.synth import pushing, render, scene_setup
+from gsim3d.synth import pushing, scene_setup
 from gsim3d.synth.acting import RESTING, smooth_path
 from gsim3d.synth.embedding import ParticleCloud, RigidFrame
-from gsim3d.synth.scene_setup import Unstable
+from gsim3d.synth.scene_setup import Unstable, turn_about_z
 from gsim3d.synth.shapes import icosphere
 from gsim3d.synth.world import SceneDraw, World
 
@@ -55,7 +55,7 @@ class CarryPolicy:
     def hands(self) -> np.ndarray:
         """Keypoints [T, 42, 3] in metres, those of the left hand first."""
         keypoints = []
-        for frame, rotation in enumerate(self._rotations() @ _turn(self.axis)):
+        for frame, rotation in enumerate(self._rotations() @ turn_about_z(self.axis)):
             for side in (-1, 1):
                 hand = SCALE * (_hand(self.curl[frame]) - [0, PALM, 0])
                 out = self.half + self.apart[frame] + RADIUS - hand[:, 0]
@@ -65,8 +65,8 @@ class CarryPolicy:
 
     def _rotations(self) -> np.ndarray:
         """Rotation of the body since time 0 [T, 3, 3]."""
-        around = _turn(self.axis)
-        return np.stack([_turn(turn) @ around @ _tilt(tilt) @ around.T for turn, tilt in self.poses[:, 3:]])
+        around = turn_about_z(self.axis)
+        return np.stack([turn_about_z(turn) @ around @ _tilt(tilt) @ around.T for turn, tilt in self.poses[:, 3:]])
 
 
 @dataclass(frozen=True)
@@ -114,11 +114,9 @@ class Hands(World):
         far = rng.uniform(*AWAY) * np.maximum(before, after)
         curl = OPEN + (CLOSED - OPEN) * np.minimum(_ramp(1 + (times - taken) / FADE), _ramp(1 + (left - times) / FADE))
         path = smooth_path(np.stack(poses), np.clip((times - taken) / (left - taken), 0, 1) if not stays else times)
-        n_balls, (points, faces) = len(TYPES), icosphere(1)
-        faces = np.concatenate([faces + len(points) * number for number in range(n_balls)])
-        skin = render.Surface(faces, np.tile(points, (n_balls, 1))[faces], lambda p: np.broadcast_to(COLOR, p.shape))
         policy = CarryPolicy(path, far * (not stays), curl, center, axis, half)
-        return dataclasses.replace(drawn, surfaces=[*drawn.surfaces, skin], policy=policy)
+        surfaces = [*drawn.surfaces, pushing.balls(len(TYPES), COLOR)]
+        return dataclasses.replace(drawn, surfaces=surfaces, policy=policy)
 
     def simulate(self, drawn):
         policy, center = drawn.policy, drawn.policy.center
@@ -149,11 +147,6 @@ def _hand(curl: float) -> np.ndarray:
 def _ramp(x: np.ndarray) -> np.ndarray:
     x = np.clip(x, 0, 1)
     return x * x * (3 - 2 * x)
-
-
-def _turn(angle: float) -> np.ndarray:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
 
 def _tilt(angle: float) -> np.ndarray:

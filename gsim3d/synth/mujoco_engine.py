@@ -16,6 +16,21 @@ RIGID_CONTACT = 300.0  # frequency of the contact spring of rigid bodies in rad/
 POISSON = 0.3
 
 
+def load_mujoco():
+    """Imports MuJoCo, without a display and without a log file in the working directory."""
+    os.environ.setdefault("MUJOCO_GL", "disable")
+    import mujoco
+
+    mujoco.set_mju_user_warning(lambda text: None)  # the default writes the log file
+    return mujoco
+
+
+def check_solver(data) -> None:
+    """Raises Unstable if the solver has diverged."""
+    if any(warning.number for warning in data.warning) or not np.isfinite(data.qpos).all():
+        raise Unstable("the solver gave up")
+
+
 def simulate(setup: SceneSetup, n_frames: int, fps: float, max_timestep: float) -> list[Embedding]:
     """Simulates a scene. Returns the embedding of each body over all frames, and of the cloth last.
 
@@ -29,10 +44,7 @@ def simulate(setup: SceneSetup, n_frames: int, fps: float, max_timestep: float) 
     Raises:
         Unstable: the solver diverges.
     """
-    os.environ.setdefault("MUJOCO_GL", "disable")
-    import mujoco
-
-    mujoco.set_mju_user_warning(lambda text: None)  # the default writes a log file to the working directory
+    mujoco = load_mujoco()
     substeps = int(np.ceil(1 / (fps * max_timestep) - 1e-9))
     model = mujoco.MjModel.from_xml_string(model_xml(setup, 1 / (fps * substeps)))
     data = mujoco.MjData(model)

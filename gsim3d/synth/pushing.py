@@ -1,6 +1,5 @@
 """Simulation of rigid bodies on a ground with a kinematic spherical pusher, by MuJoCo."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,8 +8,8 @@ import numpy as np
 from gsim3d.errors import InputError
 from gsim3d.synth import meshes, render
 from gsim3d.synth.bodies import name_rng, named_body, named_contact
-from gsim3d.synth.mujoco_engine import body_nodes, model_xml
-from gsim3d.synth.scene_setup import Pusher, RigidBody, SceneSetup, Unstable
+from gsim3d.synth.mujoco_engine import body_nodes, check_solver, load_mujoco, model_xml
+from gsim3d.synth.scene_setup import Pusher, RigidBody, SceneSetup, turn_about_z
 from gsim3d.synth.shapes import icosphere
 from gsim3d.synth.world import SceneBody
 
@@ -36,8 +35,7 @@ def draw_body(
         rng: draws appearance and contacts; None: they depend on the name only.
     """
     body = named_body(name, name_rng(name) if rng is None else rng)
-    c, s = np.cos(angle), np.sin(angle)
-    rotation = size * np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    rotation = size * turn_about_z(angle)
     vertices, collision = body.vertices @ rotation.T, body.collision_vertices @ rotation.T
     offset = np.array([*position, -collision[:, 2].min()])
     vertices, collision = vertices + offset, collision + offset
@@ -52,11 +50,16 @@ def draw_body(
     return SceneBody(rigid, render.Surface(body.faces, body.corners, body.paint), vertices, facts)
 
 
+def balls(count: int, color: tuple[float, float, float], level: int = 1) -> render.Surface:
+    """Surface of ``count`` spheres of :func:`gsim3d.synth.shapes.icosphere`, one after the other."""
+    points, faces = icosphere(level)
+    faces = np.concatenate([faces + len(points) * number for number in range(count)])
+    return render.Surface(faces, np.tile(points, (count, 1))[faces], lambda p: np.broadcast_to(color, p.shape))
+
+
 def pusher_surface() -> tuple[render.Surface, np.ndarray]:
     """Surface of the pusher, and its vertices relative to its center [V, 3] in metres."""
-    points, faces = icosphere(2)
-    surface = render.Surface(faces, points[faces], lambda p: np.broadcast_to(PUSHER_COLOR, p.shape))
-    return surface, PUSHER_RADIUS * points
+    return balls(1, PUSHER_COLOR, 2), PUSHER_RADIUS * icosphere(2)[0]
 
 
 @dataclass(frozen=True)
@@ -84,10 +87,7 @@ class PushSimulation:
     def __init__(self, bodies: Sequence[RigidBody], pusher: Pusher, fps: float):
         if not 0 < fps < np.inf:
             raise InputError(f"fps must be positive; got {fps!r}")
-        os.environ.setdefault("MUJOCO_GL", "disable")
-        import mujoco
-
-        mujoco.set_mju_user_warning(lambda text: None)  # the default writes a log file to the working directory
+        mujoco = load_mujoco()
         self._mujoco, self.fps, self.pusher_radius = mujoco, fps, pusher.radius
         self._substeps = int(np.ceil(1 / (fps * SUBSTEP) - 1e-9))
         setup = SceneSetup(tuple(bodies), 0.0, pusher=pusher)
@@ -96,7 +96,7 @@ class PushSimulation:
         self._bodies = [self._model.body(f"b{index}").id for index in range(len(setup.bodies))]
         self._spec = mujoco.mjtState.mjSTATE_INTEGRATION
         mujoco.mj_forward(self._model, self._data)
-        self._check()
+        check_solver(self._data)
         self.rest_nodes = self.nodes()
         self._advance(np.zeros((int(np.ceil(SETTLE * fps)) * self._substeps, 3)))
 
@@ -151,8 +151,4 @@ class PushSimulation:
             self._mujoco.mj_step(self._model, self._data)
         self._mujoco.mj_kinematics(self._model, self._data)
         self._mujoco.mj_comPos(self._model, self._data)
-        self._check()
-
-    def _check(self) -> None:
-        if any(warning.number for warning in self._data.warning) or not np.isfinite(self._data.qpos).all():
-            raise Unstable("the solver gave up")
+        check_solver(self._data)

@@ -86,6 +86,12 @@ class SceneSetup:
     grips: np.ndarray | None = None
 
 
+def turn_about_z(angle: float) -> np.ndarray:
+    """Rotation matrix [3, 3] about the z axis by ``angle`` rad."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+
 class Unstable(Exception):
     """The simulation has failed: a body exploded, or passed through ground or cloth."""
 

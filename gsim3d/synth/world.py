@@ -110,10 +110,7 @@ class World(ABC):
         for field in ("fps", "max_timestep", "distance", "fov", "ground_radius", "near"):
             if not 0 < getattr(self, field) < np.inf:
                 raise InputError(f"{field} must be positive; got {getattr(self, field)!r}")
-        for field in ("body_size", "drop_height", "n_bodies"):
-            low, high = getattr(self, field)
-            if not 0 < low <= high < np.inf:
-                raise InputError(f"{field} must be two positive numbers, the smaller first; got {low} {high}")
+        self._check_ranges("body_size", "drop_height", "n_bodies")
         if not self.near < self.far < np.inf:
             raise InputError(f"far must be above near; got near {self.near} and far {self.far}")
         if self.depth and self.far > writer.MAX_DEPTH:
@@ -145,6 +142,12 @@ class World(ABC):
             value = getattr(self, field)
             if not (isinstance(value, int) and value >= low):
                 raise InputError(f"{field} must be a whole number, {low} or more; got {value!r}")
+
+    def _check_ranges(self, *fields: str) -> None:
+        for field in fields:
+            low, high = getattr(self, field)
+            if not 0 < low <= high < np.inf:
+                raise InputError(f"{field} must be two positive numbers, the smaller first; got {low} {high}")
 
     def _check_ground(self) -> None:
         angle = np.linspace(0, 2 * np.pi, RIM_POINTS, endpoint=False)
