@@ -13,6 +13,7 @@ import numpy as np
 from gsim3d.data import recording
 from gsim3d.data.cameras import check_intrinsics, check_pose
 from gsim3d.data.images import as_color, as_labels, read_files
+from gsim3d.data.lenses import lens_of
 from gsim3d.data.recording import Camera, Description, Problems, Recording, inside
 from gsim3d.errors import InputError
 
@@ -75,7 +76,8 @@ def _camera(metadata: Description, name: str, n_steps: int) -> Camera:
     K = entry.array("intrinsics", (3, 3), (n_steps, 3, 3))
     if K is None or not check_intrinsics(K, size, f"{entry.where}intrinsics", problems):
         K = np.eye(3)
-    return Camera(name, size, viewmat, K)
+    shared = {key: value for key, value in metadata.values.items() if not key.startswith("cam_")}
+    return Camera(name, size, viewmat, K, lens_of({**shared, **values}, f"{metadata.where}{name}", problems))
 
 
 def _template(metadata: Description) -> str:

@@ -13,6 +13,7 @@ import numpy as np
 from gsim3d.data import recording
 from gsim3d.data.cameras import OPENGL, check_intrinsics, inverse, rotations
 from gsim3d.data.images import as_color, is_marked, is_opaque, read_files, read_image
+from gsim3d.data.lenses import lens_of
 from gsim3d.data.recording import BACKGROUND, FIXED, MOVING, Camera, Description, Problems, Recording, inside, read_json
 from gsim3d.errors import InputError
 
@@ -118,7 +119,9 @@ class _CameraFiles:
 
     def camera(self, numbers: Sequence[int]) -> Camera:
         """Returns the camera with the poses at frame ``numbers``."""
-        return Camera(self.name, self.size, self._viewmats(numbers), self._K())
+        values, what = self.description.values, f"{self.source}: camera {self.name}"
+        lens = lens_of({**values, **values["camera"], "camera": None}, what, self.description.problems)
+        return Camera(self.name, self.size, self._viewmats(numbers), self._K(), lens)
 
     def _viewmats(self, numbers: Sequence[int]) -> np.ndarray:
         poses = np.broadcast_to(np.eye(4), (len(numbers), 4, 4)).copy()

@@ -12,6 +12,8 @@ COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 FISHEYE_ORDER = ("k1", "k2", "k3", "k4")
 PARAMS_ORDER = ("k1", "k2", "k3", "k4", "p1", "p2")  # of the key distortion_params
+READ = (*COEFFICIENTS, "distortion_params", "camera_model", "is_fisheye")
+UNSET = ("", "none", "no", "false", "0", "0.0", "-0.0")  # keys with these values say nothing
 PERSPECTIVE = {
     "PINHOLE": (),
     "SIMPLE_PINHOLE": (),
@@ -27,15 +29,14 @@ FISHEYE = {
     "RADIAL_FISHEYE": ("k1", "k2"),
     "SIMPLE_RADIAL_FISHEYE": ("k1",),
 }
-# Keys of unsupported lens models, and other names of coefficients; nonzero values are an error.
-OTHER_KEYS = (
-    *(f"ftheta_p{i}" for i in range(5)), "latlong", "equirectangular", "rolling_shutter",
-    "s1", "s2", "s3", "s4", "sx1", "sy1", "tau_x", "tau_y", "b1", "b2", "p3", "p4", "omega", "xi", "skew",
-)  # fmt: skip
-UNREAD = re.compile(
-    r"(dist|distortion)(_?(coeffs?|coefficients))?|D|lens(_?(coeffs?|params))?|(radial|tangential)_distortion",
-    re.IGNORECASE,
+# Other names of lens models and coefficients, compared without case, underscores and hyphens. Set values are an error.
+OTHER_KEY = re.compile(
+    r"[sbp][1-4]|sx1|sy1|tau[xy]|omega|xi|skew|k[1-6]|kappa\d?|d|dist|distcoef.*|radial|tangential|lens(coef.*|params)?|"
+    r".*(distort|fisheye|equirect|latlong|rollingshutter|ftheta).*"
 )
+MODEL_KEY = re.compile(r"(camera|lens|projection|distortion)?(type|model|mode|projection)|lens")
+OTHER_MODEL = re.compile(r"fish|equi|omni|ftheta|spher|panoram|latlong|kannala|prism|^(kb\d?|mei|ds|eucm|ucm|fov)$")
+MAX_NESTED = 3  # levels of objects in which lens keys are searched
 SAMPLES = 2000  # angles at which the distorted radius is sampled
 WIDEST = 1.55  # radians from the optical axis; a pinhole image covers less than 90 degrees
 
@@ -48,11 +49,10 @@ def lens_of(values: Mapping, what: str, problems: Problems) -> Lens | None:
         what: name of the camera, for messages.
         problems: receives unsupported and inconsistent keys.
     """
-    for key, value in values.items():
-        if (key in OTHER_KEYS or UNREAD.fullmatch(str(key))) and _is_set(value):
-            known = ", ".join(COEFFICIENTS)
-            problems.add(f"{what}: the lens key {key:.80} is not supported; use {known}, or undistort the images")
-            return None
+    if key := _unread(values):
+        known = ", ".join(COEFFICIENTS)
+        problems.add(f"{what}: the lens key {key:.80} is not supported; use {known}, or undistort the images")
+        return None
     model, flag = values.get("camera_model"), values.get("is_fisheye", False)
     if not isinstance(flag, bool):
         problems.add(f"{what}: is_fisheye must be true or false; got {flag!r:.80}")
@@ -81,11 +81,34 @@ def lens_of(values: Mapping, what: str, problems: Problems) -> Lens | None:
     return Lens(short) if coefficients.any() else None
 
 
+def _unread(values: Mapping, level: int = 0) -> str | None:
+    """Returns the first lens key that is not read and has a value, such as "D" or "intrinsics.k1"; None without one."""
+    for key, value in values.items():
+        if not level and key in READ:
+            continue
+        name = _plain(key)
+        if isinstance(value, str) and MODEL_KEY.fullmatch(name):
+            found = OTHER_MODEL.search(_plain(value))
+        else:
+            found = OTHER_KEY.fullmatch(name) and _is_set(value)
+        if found:
+            return str(key)
+        inner = _unread(value, level + 1) if isinstance(value, Mapping) and level < MAX_NESTED else None
+        if inner:
+            return f"{key}.{inner}"
+    return None
+
+
+def _plain(name: object) -> str:
+    return re.sub(r"[\s_-]", "", str(name)[:80].lower())
+
+
 def _is_set(value) -> bool:
-    """Returns whether a value is a nonzero number, or a list or object with a nonzero item."""
+    """Returns whether a value is neither 0, null nor a text that says so, or has such an item."""
     if isinstance(value, (list, dict)):
-        return any(item not in (0, None) for item in (value.values() if isinstance(value, dict) else value))
-    return isinstance(value, (int, float)) and value != 0
+        items = value.values() if isinstance(value, dict) else value
+        return any(isinstance(item, (list, dict)) or _is_set(item) for item in items)
+    return str(value).lower() not in UNSET
 
 
 def _coefficients(values: Mapping, what: str, problems: Problems) -> dict[str, float]:
@@ -95,7 +118,11 @@ def _coefficients(values: Mapping, what: str, problems: Problems) -> dict[str, f
         numbers |= {} if found is None else dict(zip(PARAMS_ORDER, found.tolist(), strict=True))
     given = [key for key in COEFFICIENTS if key in values]
     found = array([values[key] for key in given], [(len(given),)], f"{what}: {', '.join(given)}", problems)
-    return numbers if found is None else numbers | dict(zip(given, found.tolist(), strict=True))
+    named = {} if found is None else dict(zip(given, found.tolist(), strict=True))
+    twice = next((key for key in named if "distortion_params" in values and named[key] != numbers[key]), None)
+    if twice:
+        problems.add(f"{what}: {twice} is {named[twice]:g}, but {numbers[twice]:g} in distortion_params; remove one")
+    return numbers | named
 
 
 class Undistorter:

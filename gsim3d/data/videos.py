@@ -94,7 +94,8 @@ def read(folder: Path, problems: Problems) -> Recording:
 
 
 def _entries(description: Description) -> dict[str, Description]:
-    """Returns the camera descriptions by name."""
+    """Returns the camera descriptions by name, with the top-level keys as defaults."""
+    shared = {key: value for key, value in description.values.items() if key != "cameras"}
     values, found = description.values.get("cameras"), {}
     most = recording.MAX_CAMS
     if not isinstance(values, list) or not 1 <= len(values) <= most or not all(isinstance(e, dict) for e in values):
@@ -109,7 +110,8 @@ def _entries(description: Description) -> dict[str, Description]:
             )
         if name in found:
             raise InputError(f"{description.where}two cameras have the same name: {name}")
-        found[name] = Description(entry, f"{description.where}camera {name}: ", description.problems)
+        values = {**shared, **entry}
+        found[name] = Description(values, f"{description.where}camera {name}: ", description.problems)
     return found
 
 

@@ -11,13 +11,15 @@ import torch
 
 from gsim3d.errors import InputError
 from gsim3d.io.files import read_file
-from gsim3d.math.rotations import quat_product, rotation_matrices, unit_quats
+from gsim3d.math.rotations import quat_product, rotation_matrices, rotation_to_quat, unit_quats
 from gsim3d.math.spherical_harmonics import SH_0, rotate_harmonics
 from gsim3d.state import Gaussians
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 MAX_BYTES = 2**36  # of a file: 10^8 Gaussians and more
 SMALLEST_SCALE = 1e-9  # metres; keeps the logarithm finite and is far below a pixel
+FAR = 1000  # times the extent (of 1 m or more), the distance from the origin beyond which float32 is too coarse
+SKEW = 1e-4  # tolerance of a transform that turns and scales alike along all axes
 HALF_TURN = 0.5**0.5
 # Rotations (w, x, y, z) from axes with z up to axes with y up, and back.
 Z_TO_Y_UP, Y_TO_Z_UP = (HALF_TURN, -HALF_TURN, 0.0, 0.0), (HALF_TURN, HALF_TURN, 0.0, 0.0)
@@ -28,7 +30,7 @@ class Splats:
     """One frame of Gaussians, float32 on the CPU.
 
     Attributes:
-        means: [N, 3] metres.
+        means: [N, 3] metres; float64 from files.
         quats: [N, 4] unit, (w, x, y, z).
         scales: [N, 3] standard deviations, metres, positive.
         opacities: [N] in [0, 1].
@@ -99,17 +101,63 @@ def gaussians_of(splats: Splats, path: Path) -> Gaussians:
         raise InputError(f"{path}: a scale is negative")
     tensors = {name: torch.from_numpy(value) for name, value in values.items()}
     tensors["quats"] = unit_quats(tensors["quats"])
-    return Gaussians(**tensors, cu_rows=torch.tensor([0, splats.count]), antialiased=splats.antialiased)
+    offset = None
+    if splats.means.dtype == np.float64:
+        tensors["means"], offset = relative(splats.means)
+    cu_rows = torch.tensor([0, splats.count])
+    return Gaussians(**tensors, cu_rows=cu_rows, world_offset=offset, antialiased=splats.antialiased)
+
+
+def relative(world: np.ndarray, far: float = FAR, least: float = 1.0) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """means float32 [N, 3] of finite positions [N, 3], and the ``world_offset`` float64 [1, 3] that they count from.
+
+    The offset is None unless a coordinate exceeds ``far`` times half of the extent, which counts as ``least`` or more.
+    """
+    low, high = world.min(0, initial=np.inf), world.max(0, initial=-np.inf)
+    offset = np.round(low / 2 + high / 2) if len(world) else np.zeros(3)
+    if not (np.abs(offset) > far * np.maximum((high - low) / 2, least)).any():
+        return torch.from_numpy(world.astype(np.float32)), None
+    return torch.from_numpy((world - offset).astype(np.float32)), torch.from_numpy(offset)[None]
+
+
+def joined(parts: list[Splats], path: Path) -> Splats:
+    """All Gaussians of ``parts``. Raises InputError where their harmonics have different degrees."""
+    if len({part.degree for part in parts}) > 1:
+        raise InputError(f"{path}: its parts have different degrees of harmonics")
+    return Splats(*(np.concatenate([getattr(part, name) for part in parts]) for name in FIELDS))
+
+
+def placed(splats: Splats, matrix: np.ndarray, path: Path) -> Splats:
+    """``splats`` transformed by ``matrix`` float64 [4, 4]; positions become float64.
+
+    Raises:
+        InputError: it does more than turn, scale alike along all axes and move.
+    """
+    if (matrix == np.eye(4)).all():
+        return splats
+    linear = matrix[:3, :3]
+    size = np.cbrt(np.linalg.det(linear)) if np.isfinite(matrix).all() else 0.0
+    if not size > 0 or np.abs(linear @ linear.T / size**2 - np.eye(3)).max() > SKEW:
+        raise InputError(f"{path}: a node must turn, scale alike along all axes and move; apply other transforms first")
+    w, x, y, z = rotation_to_quat(torch.from_numpy(linear / size)).tolist()
+    moved = turned(dataclasses.replace(splats, means=splats.means.astype(np.float64)), (w, x, y, z))
+    means = moved.means * size + matrix[:3, 3]
+    return dataclasses.replace(moved, means=means, scales=moved.scales * np.float32(size))
 
 
 def turned(splats: Splats, quat: tuple[float, ...]) -> Splats:
     """``splats`` in axes that are rotated by the unit quaternion ``quat`` (w, x, y, z)."""
-    turn = rotation_matrices(torch.tensor([quat], dtype=torch.float64))[0].numpy().round(12).astype(np.float32)
-    quats = quat_product(torch.tensor([quat], dtype=torch.float32), torch.from_numpy(splats.quats))
-    sh = torch.from_numpy(splats.sh)
+    turn = turn_matrix(quat).astype(splats.means.dtype)
+    quats = quat_product(torch.tensor([quat], dtype=torch.float32), torch.from_numpy(splats.quats).float())
+    sh = torch.from_numpy(splats.sh).float()
     if splats.degree:
-        sh = rotate_harmonics(sh, torch.from_numpy(turn).expand(splats.count, 3, 3))
+        sh = rotate_harmonics(sh, torch.from_numpy(turn).float().expand(splats.count, 3, 3))
     return dataclasses.replace(splats, means=splats.means @ turn.T, quats=quats.numpy(), sh=sh.numpy())
+
+
+def turn_matrix(quat: tuple[float, ...]) -> np.ndarray:
+    """float64 [3, 3] of a unit quaternion (w, x, y, z)."""
+    return rotation_matrices(torch.tensor([quat], dtype=torch.float64))[0].numpy().round(12)
 
 
 def colors_of(splats: Splats) -> np.ndarray:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+import torch
+
 from gsim3d.errors import FitWarning, InputError
 from gsim3d.io import compressed_ply, gltf, splat, spz, usd
-from gsim3d.io.arrays import Y_TO_Z_UP, Z_TO_Y_UP, Splats, gaussians_of, read_head, splats_of, turned
+from gsim3d.io.arrays import Y_TO_Z_UP, Z_TO_Y_UP, Splats, gaussians_of, read_head, splats_of, turn_matrix, turned
 from gsim3d.io.ply import read_ply, write_ply
 from gsim3d.state import Gaussians
 
@@ -84,8 +88,7 @@ def write_splats(
         raise InputError(f"{path}: frames a second must be positive; got {fps}")
     parts = [gaussians] if isinstance(gaussians, Gaussians) else list(gaussians)
     turn = _turn(path, chosen, up, Z_TO_Y_UP)
-    keeps_offset = suffix == ".ply" and turn is None
-    if not keeps_offset:
+    if suffix != ".ply":
         _warn_of_offset(path, parts)
     if not chosen.says_antialiased and any(part.antialiased for part in parts):
         message = f"{path}: {suffix} does not say that Gaussians are antialiased: small ones will appear too bright"
@@ -102,23 +105,19 @@ def write_splats(
         return
     if len(parts) != 1:
         raise InputError(f"{path}: {suffix} holds one frame; got {len(parts)}: choose a frame, or .usdc")
-    if keeps_offset:
-        write_ply(path, parts[0], frame)
+    if suffix == ".ply":
+        write_ply(path, parts[0] if turn is None else _turned(parts[0], turn, path), frame)
         return
     splats = splats_of(parts[0], frame, path)
-    splats = splats if turn is None else turned(splats, turn)
-    if suffix == ".ply":
-        write_ply(path, gaussians_of(splats, path))
-    else:
-        chosen.write(path, splats)
+    chosen.write(path, splats if turn is None else turned(splats, turn))
 
 
 def _warn_of_offset(path: Path, parts: Sequence[Gaussians]) -> None:
-    """Warns where Gaussians lose their ``world_offset``: only a .ply whose z axis points up keeps it."""
+    """Warns where Gaussians lose their ``world_offset``: only a .ply keeps it."""
     offset = next((p.world_offset for p in parts if p.world_offset is not None and bool(p.world_offset.any())), None)
     if offset is not None:
         first = ", ".join(f"{x:.2f}" for x in offset[0].tolist())
-        message = f"{path}: positions count from ({first}) m in the world, which is not kept; a .ply with z up keeps it"
+        message = f"{path}: positions count from ({first}) m in the world, which is not kept; a .ply keeps it"
         warnings.warn(message, FitWarning, stacklevel=3)
 
 
@@ -139,15 +138,19 @@ def read_splats(path: str | Path, *, up: str | None = None) -> Gaussians:
         chosen = FORMATS[".compressed.ply"]
     if chosen.read is None:
         gaussians = read_ply(path)
-        if turn is None:
-            return gaussians
-        _warn_of_offset(path, [gaussians])
-        return gaussians_of(turned(splats_of(gaussians, None, path), turn), path)
+        return gaussians if turn is None else _turned(gaussians, turn, path)
     try:
-        splats = gaussians_of(chosen.read(path), path)
+        splats = chosen.read(path)
+        splats = dataclasses.replace(splats, means=splats.means.astype(np.float64))
+        return gaussians_of(splats if turn is None else turned(splats, turn), path)
     except MemoryError:
         raise InputError(f"{path} cannot be read: no memory for its Gaussians") from None
-    return splats if turn is None else gaussians_of(turned(splats_of(splats, None, path), turn), path)
+
+
+def _turned(gaussians: Gaussians, turn: tuple, path: Path) -> Gaussians:
+    offset = gaussians.world_offset
+    offset = None if offset is None else offset @ torch.from_numpy(turn_matrix(turn)).T
+    return dataclasses.replace(gaussians_of(turned(splats_of(gaussians, None, path), turn), path), world_offset=offset)
 
 
 def _turn(path: Path, chosen: Format, up: str | None, turn: tuple) -> tuple | None:

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from gsim3d.errors import InputError
-from gsim3d.io.arrays import Z_TO_Y_UP, Splats, colors_of, read_bytes, turned, unorm
+from gsim3d.io.arrays import Z_TO_Y_UP, Splats, colors_of, joined, placed, read_bytes, turn_matrix, unorm
 from gsim3d.io.files import write_whole
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -20,6 +21,7 @@ MAGIC, JSON_CHUNK, BIN_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
 FLOAT, UBYTE, POINTS = 5126, 5121, 0
 MOST_JSON = 2**26  # bytes
 DEGREES = 4
+MAX_NODES = 1000
 
 
 def write(path: Path, splats: Splats) -> None:
@@ -69,40 +71,79 @@ def write(path: Path, splats: Splats) -> None:
 
 
 def read(path: Path) -> Splats:
-    """The Gaussians of the first primitive with the extension, turned as its node says.
+    """The Gaussians of all primitives with the extension, placed as the nodes say.
 
     Raises:
         InputError: the file is damaged, or holds no Gaussians that are read here.
     """
-    content = read_bytes(path, b"glTF")
-    document, data = _chunks(path, content)
+    document, data = _chunks(path, read_bytes(path, b"glTF"))
     try:
-        index, primitive = next(
-            (index, primitive)
-            for index, mesh in enumerate(document["meshes"])
+        parts = [
+            placed(_splats(path, document, data, primitive), matrix, path)
+            for matrix, mesh in _meshes(path, document)
             for primitive in mesh["primitives"]
             if EXTENSION in primitive.get("extensions", {})
-        )
-        attributes = primitive["attributes"]
-        column = {name: _accessor(path, document, data, attributes[name]) for name in attributes if name != "COLOR_0"}
-        coefficients = [column[_coefficient(0)]]
-        for degree in range(1, DEGREES):
-            names = [_coefficient(k) for k in range(degree**2, (degree + 1) ** 2)]
-            if names[0] not in column:
-                break
-            coefficients += [column[name] for name in names]
-        quats = column[f"{EXTENSION}:ROTATION"][:, [3, 0, 1, 2]]
-        scales, opacities = column[f"{EXTENSION}:SCALE"], column[f"{EXTENSION}:OPACITY"][:, 0]
-        splats = Splats(column["POSITION"], quats, scales, opacities, np.stack(coefficients, 1))
-        if len({len(value) for value in (*column.values(),)}) > 1 or splats.means.shape[1:] != (3,):
-            raise InputError(f"{path}: its attributes have different counts")
-        return _placed(path, document, index, splats)
-    except StopIteration:
-        raise InputError(f"{path}: no primitive has the extension {EXTENSION}") from None
+        ]
     except InputError:
         raise
     except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
         raise InputError(f"{path}: damaged, or not as {EXTENSION} says: {str(error)[:100]}") from None
+    if not parts:
+        raise InputError(f"{path}: no primitive has the extension {EXTENSION}")
+    return joined(parts, path)
+
+
+def _splats(path: Path, document: dict, data: bytes, primitive: dict) -> Splats:
+    """The Gaussians of one primitive."""
+    how = primitive["extensions"][EXTENSION]
+    for key, known in (("kernel", "ellipse"), ("colorSpace", "srgb_rec709_display")):
+        if how.get(key, known) != known:
+            raise InputError(f"{path}: {key} {str(how[key])[:40]!r} is not supported; only {known}")
+    attributes = primitive["attributes"]
+    column = {name: _accessor(path, document, data, attributes[name]) for name in attributes if name != "COLOR_0"}
+    coefficients = [column[_coefficient(0)]]
+    for degree in range(1, DEGREES):
+        names = [_coefficient(k) for k in range(degree**2, (degree + 1) ** 2)]
+        if names[0] not in column:
+            break
+        coefficients += [column[name] for name in names]
+    quats = column[f"{EXTENSION}:ROTATION"][:, [3, 0, 1, 2]]
+    scales, opacities = column[f"{EXTENSION}:SCALE"], column[f"{EXTENSION}:OPACITY"][:, 0]
+    splats = Splats(column["POSITION"], quats, scales, opacities, np.stack(coefficients, 1))
+    if len({len(value) for value in column.values()}) > 1 or splats.means.shape[1:] != (3,):
+        raise InputError(f"{path}: its attributes have different counts")
+    return splats
+
+
+def _meshes(path: Path, document: dict) -> Iterator[tuple[np.ndarray, dict]]:
+    """Yields the transform float64 [4, 4] of each node with a mesh, and the mesh."""
+    nodes = document.get("nodes", [])
+    if len(document.get("scenes", ())) > 1 or len(nodes) > MAX_NODES:
+        raise InputError(f"{path}: files of several scenes or of more than {MAX_NODES} nodes are not read")
+    below = {child for node in nodes for child in node.get("children", ())}
+    left = [(np.eye(4), number) for number in range(len(nodes)) if number not in below]
+    for _ in nodes:  # each node has one parent at most
+        if not left:
+            break
+        outer, number = left.pop()
+        node = nodes[number]
+        matrix = outer @ _matrix(node)
+        left += [(matrix, child) for child in node.get("children", ())]
+        if "mesh" in node:
+            yield matrix, document["meshes"][node["mesh"]]
+
+
+def _matrix(node: dict) -> np.ndarray:
+    """The transform float64 [4, 4] of a node within its parent."""
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    x, y, z, w = map(float, node.get("rotation", (0, 0, 0, 1)))
+    if not np.isclose(x * x + y * y + z * z + w * w, 1, atol=1e-3):
+        raise ValueError("the rotation of a node is no unit quaternion")
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn_matrix((w, x, y, z)) * np.array(node.get("scale", (1, 1, 1)), np.float64)
+    matrix[:3, 3] = node.get("translation", (0, 0, 0))
+    return matrix
 
 
 def _coefficient(k: int) -> str:
@@ -141,18 +182,3 @@ def _accessor(path: Path, document: dict, data: bytes, index: int) -> np.ndarray
     if view.get("buffer", 0) != 0 or begin + 4 * channels * count > len(data):
         raise InputError(f"{path}: truncated: an accessor ends behind the file")
     return np.frombuffer(data, "<f4", count * channels, begin).reshape(count, channels)
-
-
-def _placed(path: Path, document: dict, mesh: int, splats: Splats) -> Splats:
-    """``splats`` transformed by the node of its mesh: turned, scaled alike along all axes, moved."""
-    node = next((node for node in document.get("nodes", ()) if node.get("mesh") == mesh), {})
-    if "matrix" in node or any(mesh in other.get("children", ()) for other in document.get("nodes", ())):
-        raise InputError(f"{path}: nodes with a matrix or a parent are not read; apply transforms before exporting")
-    x, y, z, w = map(float, node.get("rotation", (0, 0, 0, 1)))
-    size = {float(value) for value in node.get("scale", (1, 1, 1))}
-    if len(size) != 1 or not 0 < min(size) < np.inf or not np.isclose(x * x + y * y + z * z + w * w, 1, atol=1e-3):
-        raise InputError(f"{path}: its node must be scaled alike along all axes, and turned by a unit quaternion")
-    moved = turned(splats, (w, x, y, z))
-    shift = np.array([float(value) for value in node.get("translation", (0, 0, 0))], np.float32)
-    means = moved.means * np.float32(min(size)) + shift
-    return Splats(means, moved.quats, moved.scales * np.float32(min(size)), moved.opacities, moved.sh)

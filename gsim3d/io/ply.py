@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.errors import InputError
-from gsim3d.io.arrays import FIELDS, MAX_BYTES, SMALLEST_SCALE, dc_of, span_of, splats_of
+from gsim3d.io.arrays import FIELDS, MAX_BYTES, SMALLEST_SCALE, dc_of, relative, span_of, splats_of
 from gsim3d.io.files import read_file, write_whole
 from gsim3d.io.ply_format import MAX_HEADER, MIP, Header, read_columns, read_header
 from gsim3d.math.rotations import unit_quats
@@ -75,7 +75,7 @@ def read_ply(path: str | Path) -> Gaussians:
     """Reads Gaussians of a .ply as one cloud: 3DGS or 2DGS, binary or text, properties in any order, others ignored.
 
     Colours are f_dc_*, or red, green, blue. 2DGS, which has two scales, becomes Gaussians of thickness 1e-9 m. Where
-    float32 does not hold the positions, they count from a ``world_offset``. They are ``antialiased`` where a comment
+    float32 is too coarse for positions, they count from a ``world_offset``. They are ``antialiased`` where a comment
     says ``SplatRenderMode: mip`` or where they have Mip-Splatting's filter_3D, which is then part of scales and
     opacities. A warning says that harmonics of degree 4 were dropped.
 
@@ -145,13 +145,11 @@ def _positions(path: Path, stack, table: dict[str, np.ndarray]) -> tuple[Tensor,
     """means float32 [N, 3], and the world_offset float64 [1, 3] that they count from, None where it is 0."""
     means = stack(["x", "y", "z"])
     world = np.stack([table[name].astype(np.float64) for name in "xyz"], 1)
-    if len(world) == 0 or (means.numpy() == world).all() or not np.isfinite(world).all():
+    if not np.isfinite(world).all():
         return means, None
-    low, high = world.min(0), world.max(0)
-    offset = np.round(low / 2 + high / 2)
-    if not offset.any() or not (np.abs(offset) > (high - low) / 2).any():
-        return means, None
-    return torch.from_numpy((world - offset).astype(np.float32)), torch.from_numpy(offset)[None]
+    if (means.numpy() == world).all():
+        return relative(world)
+    return relative(world, far=1.0, least=0.0)
 
 
 def _colors(path: Path, stack, table: dict[str, np.ndarray]) -> Tensor:
@@ -173,12 +171,14 @@ def _colors(path: Path, stack, table: dict[str, np.ndarray]) -> Tensor:
 
 
 def _of_bytes(path: Path, table: dict[str, np.ndarray], names: tuple[str, ...]) -> Tensor:
-    """The constant harmonic [N, 3] of colours that are whole numbers of their type, or floats in [0, 1]."""
+    """The constant harmonic [N, 3] of colours that are uchar, ushort of 16 bits, or floats in [0, 1]."""
     rgb = np.stack([table[name] for name in names], 1)
-    largest = np.iinfo(rgb.dtype).max if rgb.dtype.kind in "iu" else 1.0
+    kind, most = rgb.dtype.str[1:], float(rgb.max(initial=0))
+    largest = {"u1": 255, "u2": 65535, "f4": 1, "f8": 1}.get(kind)
+    if largest is None or not 0 <= rgb.min(initial=0) <= most <= largest or kind == "u2" and 0 < most <= 255:
+        wanted = "uchar, ushort that use 16 bits, or floats in [0, 1]"
+        raise InputError(f"{path}: {', '.join(names)} must be {wanted}; got {rgb.dtype} up to {most:g}")
     colors = rgb.astype(np.float32) / np.float32(largest)
-    if not ((colors >= 0) & (colors <= 1)).all():
-        raise InputError(f"{path}: {', '.join(names)} must be whole numbers, or floats in [0, 1]")
     return torch.from_numpy(dc_of(colors))
 
 

@@ -10,7 +10,7 @@ from gsim3d.data import Scene
 from gsim3d.data.lenses import Lens, Undistorter, lens_of
 from gsim3d.data.recording import Problems
 from gsim3d.errors import InputError
-from tests.data.made_scenes import edit_json, make_scene, write_transforms, write_videos
+from tests.data.made_scenes import WRITERS, edit_json, make_scene, write_transforms, write_videos
 
 FISHEYE = {"k1": 0.03, "k2": 0.005, "k3": 0.0007, "k4": 0.0001}
 RATIONAL = {"k1": 0.2, "k2": 0.05, "p1": 0.002, "p2": -0.004, "k3": 0.01, "k4": 0.1, "k5": 0.02, "k6": 0.003}
@@ -196,3 +196,37 @@ def test_changing_lens_is_refused(tmp_path):
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match="the lens .* must be the same in all frames"):
         Scene.open(tmp_path)
+
+
+OTHER_NAMES = [
+    {"K1": 0.1}, {"radialDistortion": [0.1]}, {"projection_type": "fisheye"}, {"lens-model": "Equidistant"},
+    {"fisheye": True}, {"distortion_model": {"k1": 0.3}}, {"dist": "0.1 0 0 0"}, {"intrinsics_extra": {"k1": 0.3}},
+    {"lens_mode": "ftheta"}, {"fisheye_crop_radius": 9.5}, {"distortion_params": [0.1] + [0] * 5, "k1": 0},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("layout", ["transforms", "videos", "genesis", "kubric"])
+def test_no_layout_ignores_lens_keys(tmp_path, layout):
+    folder = WRITERS[layout](tmp_path / "scene", make_scene())
+    name = {"transforms": "transforms.json", "videos": "cameras.json", "genesis": "metadata.json"}
+    file = folder / name.get(layout, "cam_0/metadata.json")
+    content = json.loads(file.read_text())
+    content.pop("camera_model", None)
+
+    def opened_with(keys, camera):
+        changed = json.loads(json.dumps(content))
+        places = {"transforms": lambda c: c["frames"], "videos": lambda c: c["cameras"]}
+        one = places.get(layout, lambda c: [c.get("camera", c.get("cam_0"))])(changed)
+        for entry in one if camera else [changed]:
+            entry |= keys
+        file.write_text(json.dumps(changed))
+        return Scene.open(folder).recording.distortions[0]
+
+    for camera in (False, True):
+        for keys in OTHER_NAMES:
+            with pytest.raises(InputError, match="the lens key|k1 is 0, but 0.1"):
+                opened_with(keys, camera)
+        assert opened_with({"camera_model": "OPENCV_FISHEYE", **FISHEYE}, camera) == Lens(
+            np.array([*FISHEYE.values()]), True
+        )
+        assert opened_with({"distortion_model": "plumb_bob", "dist": "none", "D": [0.0, 0]}, camera) is None

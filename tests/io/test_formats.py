@@ -136,16 +136,27 @@ def test_formats_without_world_offset_warn(suffix, tmp_path):
     gaussians = dataclasses.replace(make(3, 1), world_offset=offset)
     with pytest.warns(FitWarning, match=r"count from \(500000.00, 4000000.00, 0.00\) m .* not kept"):
         write_splats(tmp_path / f"a{suffix}", gaussians)
-    with pytest.warns(FitWarning, match="not kept"):
-        write_splats(tmp_path / "turned.ply", gaussians, up="y")
 
 
-def test_ply_keeps_world_offset_or_warns_when_turned(tmp_path, recwarn):
+@pytest.mark.parametrize("up", [None, "y"])
+def test_ply_keeps_world_offset_when_turned(up, tmp_path, recwarn):
     offset = torch.tensor([[5e5, 4e6, 0.0]], dtype=torch.float64)
-    write_splats(tmp_path / "a.ply", dataclasses.replace(make(3, 1), world_offset=offset))
-    assert read_splats(tmp_path / "a.ply").world_offset is not None and not recwarn.list
-    with pytest.warns(FitWarning, match="not kept"):
-        read_splats(tmp_path / "a.ply", up="y")
+    given = dataclasses.replace(make(3, 1), world_offset=offset)
+    write_splats(tmp_path / "a.ply", given, up=up)
+    read = read_splats(tmp_path / "a.ply", up=up)
+    assert read.means.abs().max() < 10 and not recwarn.list
+    torch.testing.assert_close(read.means + read.world_offset, given.means + offset, rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize("suffix", [".splat", ".glb", ".ply"])
+def test_float32_positions_far_away_count_from_a_world_offset(suffix, tmp_path):
+    given = make(3, 0)
+    given = dataclasses.replace(given, means=(given.means + torch.tensor([500000.0, 4649776.0, 100.0])))
+    write_splats(tmp_path / f"a{suffix}", given)
+    read = read_splats(tmp_path / f"a{suffix}")
+    assert read.means.abs().max() < 10 and read.world_offset is not None
+    order = read.means[:, 0].argsort(), given.means[:, 0].argsort()  # .splat sorts by size
+    torch.testing.assert_close((read.means + read.world_offset)[order[0]], given.means.double()[order[1]])
 
 
 @pytest.mark.parametrize("degree, streams", [(0, 5), (1, 6)])
@@ -261,6 +272,10 @@ def edited_glb(tmp_path, change):
     return file
 
 
+def how(document):
+    return document["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]
+
+
 @pytest.mark.parametrize(
     "change, says",
     [
@@ -270,8 +285,16 @@ def edited_glb(tmp_path, change):
         (lambda d: d["bufferViews"][0].update(byteOffset=-4), "an offset"),
         (lambda d: d["meshes"][0]["primitives"][0].pop("extensions"), "no primitive"),
         (lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop("POSITION"), "damaged"),
-        (lambda d: d["nodes"][0].update(matrix=[1] * 16), "matrix"),
-        (lambda d: d["nodes"][0].update(scale=[1, 2, 3]), "scaled alike"),
+        (lambda d: d["nodes"][0].update(matrix=[1] * 16), "scale alike"),
+        (lambda d: d["nodes"][0].update(matrix=[1]), "damaged"),
+        (lambda d: d["nodes"][0].update(scale=[1, 2, 3]), "scale alike"),
+        (lambda d: d["nodes"][0].update(scale=[-1, -1, -1]), "scale alike"),
+        (lambda d: d["nodes"][0].update(rotation=[1, 1, 0, 0]), "no unit quaternion"),
+        (lambda d: d["nodes"][0].update(translation=[float("nan"), 0, 0]), "scale alike"),
+        (lambda d: d["nodes"][0].update(children=[0]), "no primitive"),
+        (lambda d: d["scenes"].append({}), "several scenes"),
+        (lambda d: how(d).update(colorSpace="lin_rec709_display"), "colorSpace 'lin"),
+        (lambda d: how(d).update(kernel="box"), "kernel 'box'"),
         (lambda d: d.update(meshes=7), "damaged"),
     ],
 )
@@ -286,6 +309,41 @@ def test_glb_node_transform_is_applied(tmp_path):
     given = make(3, 0)
     torch.testing.assert_close(read.means, 2 * given.means + torch.tensor([0.0, 0, 5]))
     torch.testing.assert_close(read.scales, 2 * given.scales)
+
+
+MATRIX = [2, 0, 0, 0, 0, 0, -2, 0, 0, 2, 0, 0, 0, 5, 0, 1]
+GLB_PLACES = {
+    "a parent": (lambda d: d["nodes"].append({"children": [0], "translation": [0, 5, 0]}), 1, (0, 0, 5)),
+    "a matrix": (
+        lambda d: d["nodes"][0].update(matrix=[2, 0, 0, 0, 0, 0, -2, 0, 0, 2, 0, 0, 0, 5, 0, 1]),
+        2,
+        (0, 0, 5),
+    ),
+    "far away": (lambda d: d["nodes"][0].update(translation=[5e5, 100, -4e6]), 1, (5e5, 4e6, 100)),
+}
+
+
+@pytest.mark.parametrize("kind", GLB_PLACES)
+def test_glb_transforms_are_composed(kind, tmp_path):
+    change, size, move = GLB_PLACES[kind]
+    read, given = read_splats(edited_glb(tmp_path, change)), make(3, 0)
+    world = read.means + (0 if read.world_offset is None else read.world_offset)
+    expected = size * given.means.double() + torch.tensor(move, dtype=torch.float64)
+    torch.testing.assert_close(world.double(), expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(read.scales, size * given.scales)
+
+
+@pytest.mark.parametrize("part", ["primitive", "node"])
+def test_glb_reads_all_gaussians(part, tmp_path):
+    def change(document):
+        if part == "node":
+            document["nodes"].append({**document["nodes"][0], "translation": [0, 5, 0]})
+        else:
+            document["meshes"][0]["primitives"] *= 2
+
+    means = read_splats(edited_glb(tmp_path, change)).means.sort(0).values
+    move = torch.tensor([0, 0, 5.0 if part == "node" else 0.0])
+    torch.testing.assert_close(means, torch.cat([make(3, 0).means, make(3, 0).means + move]).sort(0).values)
 
 
 def test_compressed_ply_is_recognised_by_content(tmp_path):

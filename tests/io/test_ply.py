@@ -179,6 +179,22 @@ def test_read_ply_colours_without_harmonics(kind, names, values, colors, form, t
     assert (got.sh[0, 0] * SH_0 + 0.5).tolist() == pytest.approx(colors, abs=1e-6)
 
 
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize(
+    ("kind", "values"),
+    [
+        ("int", (255, 0, 51)),
+        ("ushort", (255, 0, 51)),
+        ("int", (9, 9, 9)),
+        ("float", (255.0, 0, 51)),
+    ],
+)
+def test_read_ply_refuses_colours_of_unclear_range(kind, values, form, tmp_path):
+    properties = XYZ + [(kind, name) for name in ("red", "green", "blue")] + REST
+    with pytest.raises(InputError, match="red, green, blue must be uchar, ushort .* got .*int|got float.* up to 255"):
+        read(tmp_path, rows_of(properties, [[1, 2, 3, *values, *SHAPE]], form))
+
+
 def test_read_ply_prefers_harmonics_to_colours(tmp_path):
     properties = XYZ + DC + [("uchar", name) for name in ("red", "green", "blue")] + REST
     got = read(tmp_path, rows_of(properties, [[1, 2, 3, 0.1, 0.2, 0.3, 255, 0, 0, *SHAPE]]))
@@ -303,7 +319,7 @@ def test_ply_survey_positions_keep_their_digits(position, form, tmp_path):
 
 
 def test_read_ply_offset_is_none_near_the_origin(tmp_path):
-    for kind, position in (("double", (1.5, 2.5, 1e6)), ("float", (5e5, 4649776.0, 1.0)), ("double", (0.1, 0.2, 0.3))):
+    for kind, position in (("double", (1.5, 2.5, 1e3)), ("float", (500.0, -999.0, 1.0)), ("double", (0.1, 0.2, 0.3))):
         got = read(tmp_path, rows_of([(kind, n) for n in "xyz"] + DC + REST, [[*position, 0, 0, 0, *SHAPE]]))
         assert got.world_offset is None and got.means[0].tolist() == pytest.approx(position)
 
