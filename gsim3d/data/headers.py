@@ -40,25 +40,27 @@ def _png(data: bytes) -> Header | None:
     if len(data) < 33 or data[12:16] != b"IHDR":
         return None
     # Checks every chunk length: decoders allocate the length a chunk declares, up to 2 GiB.
-    at, alpha, whole = 8, data[25] in (4, 6), False
+    at, alpha, whole, refused = 8, data[25] in (4, 6), False, ""
     while at + 12 <= len(data) and not whole:
         kind = data[at + 4 : at + 8]
         alpha, whole = alpha or kind == b"tRNS", kind == b"IEND"
+        refused = "is animated" if kind == b"acTL" else refused
         at += 12 + int.from_bytes(data[at : at + 4], "big")
-    return Header(struct.unpack_from(">II", data, 16), whole, alpha)
+    return Header(struct.unpack_from(">II", data, 16), whole, alpha, refused)
 
 
 def _jpeg(data: bytes) -> Header | None:
-    at, size = 2, None
+    at, size, refused = 2, None, ""
     while at + 9 < len(data) and data[at] == 0xFF:
         marker = data[at + 1]
         if marker == 0xFF:  # fill byte
             at += 1
             continue
         if marker == 0xDA:  # start of scan; inside a scan 0xFF 0xD9 can only be the end of the image
-            return size and Header(size, data.rfind(b"\xff\xd9") > at)
+            return size and Header(size, data.rfind(b"\xff\xd9") > at, refused=refused)
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             size = struct.unpack_from(">HH", data, at + 5)[::-1]
+            refused = "is CMYK" if data[at + 9] == 4 else ""
         at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
     return size and Header(size, False)
 

@@ -21,7 +21,7 @@ MAX_FILE = 1 << 29  # bytes
 HEADER = 1 << 16  # bytes; enough for most image headers
 MAX_ID = 16  # masks with only smaller values are taken to hold body ids
 MAX_SOFT = 0.2  # largest fraction of mask pixels with values near half of the range
-MAX_LABELS = 256  # masks with more distinct values are not label images
+MAX_LABELS, MAX_SMALL = 256, 8  # masks with more distinct values are not label images, also of bodies of few pixels
 
 
 def read_image(file: Path, size: tuple[int, int], frame: str, problems: Problems) -> np.ndarray | None:
@@ -102,7 +102,7 @@ def as_labels(image: np.ndarray, file: Path, frame: str, problems: Problems) -> 
     if image.ndim == 3 and (image[..., :1] != image[..., :3]).any():
         problems.add(f"image {file} ({frame}) must be a single-channel label image; got a colour image")
         return None
-    labels = image if image.ndim == 2 else image[..., 0]
+    labels = np.where(is_opaque(image), image if image.ndim == 2 else image[..., 0], BACKGROUND)
     if file.suffix.lower() in LOSSY_SUFFIXES or labels.max() > 255:
         problems.add(f"image {file} ({frame}) must hold labels from 0 to 255, in a lossless format (PNG or TIFF)")
         return None
@@ -113,9 +113,11 @@ def as_mask(image: np.ndarray, file: Path | None, frame: str, problems: Problems
     """Converts a mask to labels uint8 [h, w]: MOVING where it is set, else BACKGROUND.
 
     Binary masks, including those with compression noise or soft borders, are thresholded at half of their range; label
-    images are set where they are not 0. Colour images are reduced to the maximum over channels.
+    images are set where they are not 0. Colour images are reduced to the maximum over channels; of images of one colour
+    alpha is the mask.
     """
-    grey = _over_black(image)
+    is_cut_out = _has_alpha(image) and np.ptp(image[..., 3]) > 0 and (image[..., :3] == image[0, 0, :3]).all()
+    grey = image[..., 3] if is_cut_out else _over_black(image)
     grey = np.ascontiguousarray(grey if grey.ndim == 2 else grey.max(-1))
     lossy = file is not None and file.suffix.lower() in LOSSY_SUFFIXES
     marked = _marked(grey, lossy)
@@ -162,7 +164,7 @@ def _marked(grey: np.ndarray, lossy: bool) -> np.ndarray | None:
     levels = np.flatnonzero(np.bincount(grey.ravel()))
     low, high = int(levels[0]), int(levels[-1])
     full = np.iinfo(grey.dtype).max
-    if high == 0 or (high < MAX_ID and not lossy) or _are_labels(grey, levels):
+    if high == 0 or (high < MAX_ID and not lossy) or _are_labels(grey, levels, lossy):
         return grey > 0
     if len(levels) == 1 or lossy:  # lossy compression keeps 0 and 255, but adds values between
         low, high = 0, full
@@ -174,14 +176,18 @@ def _marked(grey: np.ndarray, lossy: bool) -> np.ndarray | None:
     return grey > (low + high) // 2
 
 
-def _are_labels(grey: np.ndarray, levels: np.ndarray) -> bool:
+def _are_labels(grey: np.ndarray, levels: np.ndarray, lossy: bool) -> bool:
     """Returns whether most intermediate values form flat regions, unlike noise and soft borders."""
     inner = levels[1:-1]
     if not 0 < len(inner) <= MAX_LABELS:
         return False
-    block = np.ones((3, 3), np.uint8)
-    flat = grey[(cv2.erode(grey, block) == cv2.dilate(grey, block))]
-    return 2 * np.isin(inner, flat).sum() >= len(inner)
+    flat = cv2.erode(grey, np.ones((3, 3), np.uint8)) == cv2.dilate(grey, np.ones((3, 3), np.uint8))
+    are_flat = 2 * np.isin(inner, grey[flat]).sum() >= len(inner)
+    if are_flat or lossy or len(inner) > MAX_SMALL:
+        return are_flat
+    small, wide = np.ones((2, 2), np.uint8), np.ones((7, 7), np.uint8)  # a body of few pixels, apart from others
+    alone = (cv2.erode(grey, small) == cv2.dilate(grey, small)) & (cv2.dilate(grey, wide) < levels[-1])
+    return bool(alone[grey > levels[0]].any())
 
 
 class ImageCache:

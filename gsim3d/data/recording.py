@@ -243,9 +243,15 @@ def read_json(file: Path) -> dict:
 
 
 def inside(folder: Path, relative: str, what: str) -> Path:
-    """Returns ``folder / relative``. Raises InputError if it resolves to a path outside of ``folder``."""
+    """Returns ``folder / relative``; backslashes separate folders unless the name of a file has them.
+
+    Raises:
+        InputError: it resolves to a path outside of ``folder``.
+    """
     file = folder / relative
     try:
+        if "\\" in relative and not file.exists():
+            file = folder / relative.replace("\\", "/")
         root, target = folder.resolve(), file.resolve()
         if target != root and target.is_relative_to(root) and len(file.name) <= MAX_NAME:
             return file

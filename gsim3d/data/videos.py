@@ -189,7 +189,7 @@ def _masks(folder: Path, description: Description, sources: list[_Frames | Video
 
 def _frames_of(folder: Path, name: str, size: tuple[int, int], source: Path, problems: Problems) -> _Frames | Video:
     """Finds the frames of a camera; they have no numbers on error."""
-    videos = [folder / f"{name}{suffix}" for suffix in VIDEO_SUFFIXES if (folder / f"{name}{suffix}").is_file()]
+    videos = [path for path in folder.iterdir() if path.stem == name and path.suffix.lower() in VIDEO_SUFFIXES]
     frames = _Frames(folder, Path(name), name, size)
     if len(videos) == 1 and not (folder / name).is_dir():
         return Video(inside(folder, videos[0].name, f"camera {name}"), name, size, problems)

@@ -17,6 +17,19 @@ from gsim3d.io.files import read_file
 SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 MAX_MESH, MAX_TEXTURE = 1 << 28, 1 << 28  # largest file in bytes
 SLOTS = 3  # largest number of channels of a corner
+SURFACES = ("curv", "curv2", "surf")  # keywords of free-form geometry in OBJ files
+CHANGES = ("-s", "-o", "-t", "-mm", "-clamp", "-imfchan")  # options of map_Kd that change the picture, unless ...
+UNCHANGED = re.compile(r"-s( 1(\.0*)?)+|-[ot]( 0(\.0*)?)+|-mm 0 1|-clamp off")
+READ_EXTENSIONS = rb"KHR_(?:materials_\w+|lights_punctual)"
+# What trimesh drops, by suffix; glTF files also for what they require.
+DROPPED = {
+    ".ply": rb"property \w+ (r|(?:diffuse|ambient)_red)\s",
+    **dict.fromkeys(
+        (".glb", ".gltf"),
+        rb'"(KHR_texture_transform|sparse)"|"extensionsRequired"\s*:\s*\[\s*(?:"%b"[\s,]*)*"(\w+)|'
+        rb'"baseColorTexture"\s*:\s*\{[^{}]*"(texCoord)"\s*:\s*[1-9]' % READ_EXTENSIONS,
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -96,9 +109,9 @@ def _read_obj(path: Path, data: bytes) -> list[Piece]:
     vertices, colours, uvs, libraries = [], [], [], []
     faces: dict[str | None, list] = {}  # material -> corners of triangles: (vertex, uv or -1)
     material = None
-    text = data.decode(errors="surrogateescape").replace("\\\n", " ").replace("\\\r\n", " ")
+    text = data.decode("utf-8-sig", "surrogateescape").replace("\\\n", " ").replace("\\\r\n", " ")
     for number, line in enumerate(text.splitlines(), 1):
-        key, _, rest = line.strip().partition(" ")
+        key, rest = (*line.split(None, 1), "", "")[:2]
         words = rest.split("#")[0].split()
         try:
             if key == "v":
@@ -118,11 +131,15 @@ def _read_obj(path: Path, data: bytes) -> list[Piece]:
                 material = rest.strip()
             elif key == "mtllib":
                 libraries.append(rest.strip())
+            elif key in SURFACES:
+                raise ValueError(f"{key}: free-form geometry is not supported; convert it to polygons")
         except (ValueError, IndexError) as error:
             raise InputError(f"mesh {path} cannot be read: line {number}: {str(error)[:100]}") from None
     materials = _materials(path, libraries) if any(name is not None for name in faces) else {}
     points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
-    has_colours = bool(colours) and all(colour is not None for colour in colours)
+    n_coloured = sum(colour is not None for colour in colours)
+    if n_coloured not in (0, len(colours)):
+        raise InputError(f"mesh {path}: {n_coloured} of {len(colours)} vertices have colours; give all or none colours")
     pieces = []
     for name, found in faces.items():
         index = np.array(found, dtype=np.int64)  # [F, 3, 2]
@@ -136,7 +153,7 @@ def _read_obj(path: Path, data: bytes) -> list[Piece]:
             if (index[..., 1] < 0).any():
                 raise InputError(f"mesh {path}: faces of material {name!r} have a texture, but no texture coordinates")
             pieces.append(Piece(triangles, np.array(uvs)[index[..., 1]], texture_lookup(colour)))
-        elif has_colours:
+        elif n_coloured:
             pieces.append(_vertex_colours(triangles, np.array(colours)[index[..., 0]], path))
         elif colour is not None:
             pieces.append(_constant(triangles, colour))
@@ -172,8 +189,8 @@ def _materials(path: Path, libraries: list[str]) -> dict[str, np.ndarray | None]
 
 def _read_mtl(path: Path, file: Path) -> dict[str, np.ndarray | None]:
     found, name = {}, None
-    for line in read_file(file, MAX_MESH).decode(errors="surrogateescape").splitlines():
-        key, _, rest = line.strip().partition(" ")
+    for line in read_file(file, MAX_MESH).decode("utf-8-sig", "surrogateescape").splitlines():
+        key, rest = (*line.split(None, 1), "", "")[:2]
         rest = re.split(r"(?:^|\s)#", rest)[0]
         key, words = key.lower(), rest.split()
         if key == "newmtl":
@@ -187,6 +204,8 @@ def _read_mtl(path: Path, file: Path) -> dict[str, np.ndarray | None]:
             if found[name].shape != (3,) or not np.isfinite(found[name]).all():
                 raise InputError(f"mesh {path}: Kd of material {name!r} must be three numbers; got {rest[:80]!r}")
         elif key == "map_kd" and words:
+            if option := next((word for word in UNCHANGED.sub("", " ".join(words)).split() if word in CHANGES), ""):
+                raise InputError(f"mesh {path}: option {option} of map_Kd of material {name!r} is not supported")
             texture = words[-1] if words[0].startswith("-") else rest.strip()
             image = file.parent / texture.replace("\\", "/")
             if not image.is_file():
@@ -205,18 +224,23 @@ def _vertex_colours(triangles: np.ndarray, colours: np.ndarray, path: Path) -> P
 def _read_other(path: Path, data: bytes) -> list[Piece]:
     import trimesh
 
-    kind, start = path.suffix.lower(), data[:4096]
-    if kind == ".off" and _has_off_colours(data):
-        raise InputError(f"mesh {path} has colours, which are not supported in OFF files: save it as PLY or OBJ")
-    if kind == ".stl" and b"COLOR=" in start[:80]:
-        raise InputError(f"mesh {path} has colours, which are not supported in STL files: save it as PLY or OBJ")
+    kind = path.suffix.lower()
+    if kind == ".off" and _has_off_colours(data) or kind == ".stl" and _has_stl_colours(data):
+        which = kind[1:].upper()
+        raise InputError(f"mesh {path} has colours, which are not supported in {which} files: save it as PLY or OBJ")
+    dropped = re.search(DROPPED.get(kind, rb"(?!)"), data[: 1 << 16] if kind == ".ply" else data)
+    if dropped:
+        what = next(filter(None, dropped.groups())).decode()
+        raise InputError(f"mesh {path} has {what[:80]}, which is not supported: save it without, or as OBJ")
     try:
         scene = trimesh.load_scene(path, process=False)
         nodes = [(scene.graph[node][0], scene.geometry[scene.graph[node][1]]) for node in scene.graph.nodes_geometry]
+        pieces = [_of_trimesh(mesh, matrix, path) for matrix, mesh in nodes if isinstance(mesh, trimesh.Trimesh)]
+    except InputError:
+        raise
     except Exception as error:  # trimesh raises whatever its parsers raise
         raise InputError(f"mesh {path} cannot be read: {' '.join(str(error).split())[:200]}") from error
-    pieces = [_of_trimesh(mesh, matrix, path) for matrix, mesh in nodes if isinstance(mesh, trimesh.Trimesh)]
-    if kind == ".ply" and b"TextureFile" in start and any(piece.corners is None for piece in pieces):
+    if kind == ".ply" and b"TextureFile" in data[:4096] and any(piece.corners is None for piece in pieces):
         raise InputError(f"mesh {path} has a texture that is missing, or has no texture coordinates")
     return pieces
 
@@ -237,6 +261,13 @@ def _has_off_colours(data: bytes) -> bool:
         return False
 
 
+def _has_stl_colours(data: bytes) -> bool:
+    """Whether the header of a binary STL has a colour, or its faces have attributes, which hold colours."""
+    is_binary = len(data) > 84 and len(data) % 50 == 34 and not data.startswith(b"solid ")
+    attributes = np.frombuffer(data[84:], np.uint8).reshape(-1, 50)[:, 48:] if is_binary else np.zeros(0)
+    return b"COLOR=" in data[:80] or bool(attributes.any())
+
+
 def _of_trimesh(mesh, matrix: np.ndarray, path: Path) -> Piece:
     """Piece of ``mesh`` transformed by ``matrix`` [4, 4]."""
     faces, vertices = np.asarray(mesh.faces, dtype=np.int64), np.asarray(mesh.vertices, dtype=np.float64)
@@ -250,6 +281,8 @@ def _of_trimesh(mesh, matrix: np.ndarray, path: Path) -> Piece:
         return Piece(triangles, np.asarray(visual.vertex_colors, dtype=np.float64)[:, :3][faces] / 255, lambda c: c)
     if visual.kind == "face":
         colours = np.asarray(visual.face_colors, dtype=np.float64)[:, None, :3].repeat(3, 1)
+        if len(colours) != len(triangles):
+            raise InputError(f"mesh {path}: faces with colours must be triangles")
         return Piece(triangles, colours / 255, lambda c: c)
     if visual.kind != "texture":
         return Piece(triangles)

@@ -8,6 +8,7 @@ from gsim3d.errors import InputError
 from gsim3d.synth.mesh_files import Piece, joined_paint, read_pieces
 from gsim3d.synth.shapes import PALETTE, PATTERNS, Body, normalise
 
+MAX_FOLDED, FLAT = 1e-3, 1e-9  # largest share of the area in folded faces, and 1 - cosine between their planes
 COLLISION_VERTICES = 300  # approximate largest number of vertices of a collision mesh
 NEARLY_CONVEX = 0.06  # depth of concavities, over the body's size, below which the convex hull collides
 SLAB_CELLS = 4  # cells along the longest side of a concave body, each with its own convex piece
@@ -74,6 +75,8 @@ def load_body(path: str | Path, up: str = "y", *, fill_holes: bool = False) -> B
     n_different = len(np.unique(np.sort(faces, axis=1), axis=0))
     if n_different < len(faces):
         raise InputError(f"mesh {path} has {len(faces) - n_different} duplicate faces; remove them")
+    if _folded(positions, faces) > MAX_FOLDED:
+        raise InputError(f"mesh {path} has faces that fold back onto others, as of concave polygons: triangulate it")
     inwards = _turned_inwards(positions, faces)
     faces[inwards], corners[inwards] = faces[inwards, ::-1], corners[inwards, ::-1]
     return Body(path.stem, positions, faces, *cluster(positions, faces, COLLISION_VERTICES), corners, paint)
@@ -116,6 +119,23 @@ def _components(n: int, cells: np.ndarray) -> np.ndarray:
         np.minimum.at(label, cells, label[cells].min(1)[:, None])
         label = label[label]
     return label
+
+
+def _folded(positions: np.ndarray, faces: np.ndarray) -> float:
+    """Share of the area in faces that lie in the plane of a neighbour, on the same side of the common edge."""
+    a, b, c = (positions[faces[:, k]] for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    far = positions[(faces.sum(1).repeat(3) - edges.sum(1))]  # corner opposite of the edge
+    start, along = positions[edges[:, 0]], positions[edges[:, 1]] - positions[edges[:, 0]]
+    length = np.maximum((along**2).sum(1), np.finfo(float).tiny)
+    away = far - start - ((far - start) * along).sum(1)[:, None] / length[:, None] * along
+    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), np.finfo(float).tiny)
+    order = np.lexsort(edges.T)
+    same = (edges[order[1:]] == edges[order[:-1]]).all(1)
+    first, second = order[:-1][same], order[1:][same]
+    folded = (away[first] * away[second]).sum(1) > 1 - FLAT
+    return float(area[np.unique(np.concatenate([first[folded], second[folded]]) // 3)].sum() / area.sum())
 
 
 def _turned_inwards(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@ import struct
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from gsim3d.data import Scene
 from gsim3d.data.check import check_scene
@@ -240,3 +241,38 @@ def test_genesis_rgba_is_composed_on_black(tmp_path):
         cv2.imwrite(str(file), np.concatenate([image, np.full((*image.shape[:2], 1), 51, np.uint8)], -1))
     got = Scene.open(folder).images(range(3), range(4)).permute(0, 1, 3, 4, 2).numpy()
     assert np.abs(got - made.rgb * 0.2).max() <= 0.51
+
+
+@pytest.mark.parametrize("color", [0, 90, 255])
+def test_as_mask_of_one_colour_is_its_alpha(tmp_path, color):
+    mask = discs()
+    image = cv2.merge([np.full_like(mask, color)] * 3 + [mask])
+    assert (moving(stored(tmp_path, "m.png", image), tmp_path / "m.png") == (mask > 0)).all()
+    image[..., 3] = 255  # opaque: the colour says it
+    if color == 90:
+        pytest.raises(InputError, moving, stored(tmp_path, "m.png", image), tmp_path / "m.png")
+        return
+    assert moving(stored(tmp_path, "m.png", image), tmp_path / "m.png").all() == (color > 0)
+
+
+def test_as_mask_keeps_small_bodies_beside_large_ones(tmp_path):
+    mask = discs()
+    mask[5:7, 20:40], mask[40:42, 50:52] = 90, 17
+    assert (moving(stored(tmp_path, "m.png", mask), tmp_path / "m.png") == (mask > 0)).all()
+
+
+def test_transparent_labels_are_background(tmp_path):
+    labels = np.full(SIZE[::-1], MOVING, np.uint8)
+    image = stored(tmp_path, "m.png", cv2.merge([labels] * 3 + [discs()]))
+    read = as_labels(image, tmp_path / "m.png", "", Problems())
+    assert ((read == MOVING) == (discs() > 0)).all() and not read[discs() == 0].any()
+
+
+def test_cmyk_and_animated_images_are_refused(tmp_path):
+    picture = Image.fromarray(discs())
+    picture.convert("CMYK").save(tmp_path / "a.jpg")
+    picture.save(tmp_path / "a.png", save_all=True, append_images=[Image.fromarray(255 - discs())])
+    picture.convert("RGB").save(tmp_path / "a.webp", save_all=True, append_images=[Image.new("RGB", SIZE)])
+    for name, message in (("a.jpg", "is CMYK"), ("a.png", "is animated"), ("a.webp", "is animated")):
+        with pytest.raises(InputError, match=f"{name} .*{message}"):
+            read_image(tmp_path / name, SIZE, "", Problems())

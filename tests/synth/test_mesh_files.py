@@ -1,5 +1,6 @@
 """Mesh files: all objects, materials and colours are read, or the file is refused."""
 
+import json
 import struct
 
 import numpy as np
@@ -202,6 +203,46 @@ def off(folder, header, colours="", faces=""):
     return folder / "body.off"
 
 
+def prism():
+    """An L-shaped prism, its ends polygons of six corners."""
+    shape = [(2, 1), (1, 1), (1, 2), (0, 2), (0, 0), (2, 0)]
+    text = "".join(f"v {x} {y} {z}\n" for z in (0, 1) for x, y in shape) + "f 6 5 4 3 2 1\nf 7 8 9 10 11 12\n"
+    return text + "".join(f"f {k + 1} {(k + 1) % 6 + 1} {(k + 1) % 6 + 7} {k + 7}\n" for k in range(6))
+
+
+def textured(folder, options):
+    (folder / "skin.mtl").write_text(f"newmtl red\nmap_Kd {options}skin.png\n")
+    return write(folder, "mtllib skin.mtl\nusemtl red\n" + vertices() + sides(1))
+
+
+def coloured_ply(folder, of_vertices, of_faces):
+    def colours(first):
+        names = [first, *(first.replace("red", name) if "red" in first else name for name in ("green", "blue"))]
+        return "".join(f"property uchar {name}\n" for name in names) if first else ""
+
+    header = "ply\nformat ascii 1.0\nelement vertex 8\n" + "".join(f"property float {name}\n" for name in "xyz")
+    header += f"{colours(of_vertices)}element face 6\nproperty list uchar int vertex_indices\n{colours(of_faces)}"
+    rows = [[*corner, *([9, 9, 9] if of_vertices else [])] for corner in CORNERS]
+    rows += [[4, *side, *([9, 9, 9] if of_faces else [])] for side in SIDES]
+    body = "".join(" ".join(map(str, row)) + "\n" for row in rows)
+    (folder / "body.ply").write_text(header + "end_header\n" + body)
+    return folder / "body.ply"
+
+
+def stl(folder):
+    data = bytearray(trimesh.exchange.stl.export_stl(box(0)))
+    data[84 + 48 : 84 + 50] = struct.pack("<H", 1 << 15 | 31)
+    (folder / "body.stl").write_bytes(data)
+    return folder / "body.stl"
+
+
+def glb(folder, **keys):
+    box(0).export(folder / "body.gltf")
+    content = json.loads((folder / "body.gltf").read_text())
+    (folder / "body.gltf").write_text(json.dumps({**content, **keys}))
+    return folder / "body.gltf"
+
+
 REFUSED = {
     "a face twice": (lambda d: write(d, vertices() + sides(1) + sides(1)), "has 12 duplicate faces"),
     "a side twice": (lambda d: write(d, vertices() + sides(1) + sides(1, [SIDES[0][::-1]] * 2)), "duplicate faces"),
@@ -215,6 +256,21 @@ REFUSED = {
     "colours out of range": (lambda d: write(d, vertices(0, (-1, 0, 0)) + sides(1)), "vertex colours must be in"),
     "an archive": (lambda d: write(d, "", "body.zip"), "the supported formats are .glb, .gltf, .obj"),
     "COFF": (lambda d: off(d, "COFF", " 255 0 0 255"), "colours, which are not supported in OFF"),
+    "a concave polygon": (lambda d: write(d, prism()), "fold back onto others, as of concave polygons"),
+    "a texture that repeats": (lambda d: textured(d, "-s 2 2 1 "), "option -s of map_Kd of material 'red'"),
+    "a texture that is moved": (lambda d: textured(d, "-blendu on -o 1 0 0 "), "option -o of map_Kd"),
+    "colours of some vertices": (lambda d: write(d, vertices(0, RED) + sides(1) + vertices(3) + sides(9)), "8 of 16"),
+    "free-form geometry": (lambda d: write(d, vertices() + sides(1) + "surf 0 1 0 1 1 2 3 4\n"), "line 15: surf"),
+    "other names of PLY colours": (
+        lambda d: coloured_ply(d, "diffuse_red", ""),
+        "has diffuse_red, which is not supported",
+    ),
+    "colours r, g, b of a PLY": (lambda d: coloured_ply(d, "r", ""), "has r, which is not supported"),
+    "colours of PLY polygons": (lambda d: coloured_ply(d, "", "red"), "faces with colours must be triangles"),
+    "colours of STL faces": (lambda d: stl(d), "colours, which are not supported in STL"),
+    "a texture transform": (lambda d: glb(d, extensionsUsed=["KHR_texture_transform"]), "has KHR_texture_transform"),
+    "compression": (lambda d: glb(d, extensionsRequired=["KHR_materials_unlit", "KHR_draco_x"]), "has KHR_draco_x"),
+    "second coordinates": (lambda d: glb(d, x={"baseColorTexture": {"index": 0, "texCoord": 1}}), "has texCoord"),
     "colours of OFF faces": (lambda d: off(d, "OFF", faces=" 255 0 0"), "colours, which are not supported in OFF"),
 }
 
@@ -242,6 +298,16 @@ def test_obj_missing_textures_are_named(tmp_path):
     (tmp_path / "skin.mtl").write_text("newmtl skin\nKd 1 red 0\n")
     with pytest.raises(InputError, match="Kd of material 'skin' must be three numbers"):
         load_body(path)
+
+
+@pytest.mark.parametrize("start", [b"", b"\xef\xbb\xbf"])
+def test_obj_words_may_be_apart_by_tabs(tmp_path, start):
+    text = ("mtllib skin.mtl\nusemtl red\n" + vertices() + sides(1)).replace(" ", "\t")
+    path = write(tmp_path, "")
+    path.write_bytes(start + text.encode())
+    (tmp_path / "skin.mtl").write_bytes(start + b"newmtl\tred\n\tKd\t1 0 0\n")
+    body = load_body(path)
+    np.testing.assert_allclose(body.paint(body.corners[0]), [RED] * 3)
 
 
 def test_mtl_comments_and_single_material(tmp_path):
