@@ -23,6 +23,7 @@ FILE = "transforms.json"
 SPLITS = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 ANGLES = ("camera_angle_x", "camera_angle_y")
 OWN = ("frames", "file_path", "transform_matrix", "time", "camera", "mask_path", "label_path")  # never defaults
+SAME_FOCAL = 0.02  # relative difference between focal lengths given as such and as angles
 SAME_TIME = 1e-6  # fraction of the duration; closer times belong to one step
 
 
@@ -119,7 +120,8 @@ def frames_of(folder: Path, source: Path, description: dict) -> list[dict]:
                 raise InputError(f"{source}: frames[{number}].{key} must be a string; got {str(frame.get(key))[:80]!r}")
             inside(folder, frame[key], f"{source}: frames[{number}].{key}")
     shared = {key: value for key, value in description.items() if key not in OWN}
-    return [{**shared, **frame} for frame in frames]
+    without_angles = {key: value for key, value in shared.items() if key not in ANGLES}
+    return [{**(without_angles if "fl_x" in frame else shared), **frame} for frame in frames]
 
 
 def _times(frames: list[dict]) -> set[str]:
@@ -253,6 +255,11 @@ class _CameraFrames:
         values = array([given[key] for key in keys], [(4,)], f"{what}: fl_x, fl_y, cx, cy", problems)
         if values is None:
             return np.eye(3)
+        for axis, angle in enumerate(angles):
+            if angle and abs(values[axis] / angle - 1) > SAME_FOCAL:
+                problems.add(
+                    f"{what}: {keys[axis]} is {values[axis]:g}, but {angle:g} by {ANGLES[axis]}; remove one of them"
+                )
         K = np.array([[values[0], 0, values[2]], [0, values[1], values[3]], [0, 0, 1.0]])
         return K if check_intrinsics(K, self.size, what, problems) else np.eye(3)
 

@@ -224,7 +224,7 @@ def test_no_layout_ignores_lens_keys(tmp_path, layout):
 
     for camera in (False, True):
         for keys in OTHER_NAMES:
-            with pytest.raises(InputError, match="the lens key|k1 is 0, but 0.1"):
+            with pytest.raises(InputError, match="the lens key|k1 is 0, but 0.1|did you mean"):
                 opened_with(keys, camera)
         assert opened_with({"camera_model": "OPENCV_FISHEYE", **FISHEYE}, camera) == Lens(
             np.array([*FISHEYE.values()]), True

@@ -98,6 +98,31 @@ def test_transforms_camera_angles_of_axes_and_frames(tmp_path):
             Scene.open(tmp_path)
 
 
+def test_transforms_focal_lengths_agree_with_angles(tmp_path):
+    write_transforms(tmp_path, make_scene())
+    edit_json(tmp_path / "transforms.json", lambda content: content.update(camera_angle_x=0.3))  # frames have fl_x
+    assert Scene.open(tmp_path).n_steps == 4
+    edit_json(tmp_path / "transforms.json", lambda content: content["frames"][0].update(camera_angle_x=0.3))
+    with pytest.raises(InputError, match=r"frame 0: fl_x is 5\d.*, but 158.* by camera_angle_x; remove one"):
+        Scene.open(tmp_path)
+
+
+def test_transforms_paths_of_windows(tmp_path):
+    write_transforms(tmp_path, make_scene())
+    expected = Scene.open(tmp_path).images([0, 1], [0])
+
+    def edit(content):
+        for frame in content["frames"]:
+            frame |= {key: frame[key].replace("/", "\\") for key in ("file_path", "label_path") if key in frame}
+            assert "\\" in frame["file_path"]
+
+    edit_json(tmp_path / "transforms.json", edit)
+    assert (Scene.open(tmp_path).images([0, 1], [0]) == expected).all()
+    edit_json(tmp_path / "transforms.json", lambda content: content["frames"][0].update(file_path="..\\a.png"))
+    with pytest.raises(InputError, match="not a file inside the scene folder"):
+        Scene.open(tmp_path)
+
+
 def test_transforms_json_precedes_the_splits(tmp_path):
     made = make_scene(n_steps=1)
     write_synthetic(tmp_path, made, {"train": [(0, 0), (0, 1), (0, 2)]})

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import shutil
 
 import cv2
 import numpy as np
@@ -29,6 +30,7 @@ from tests.data.made_scenes import (
     write_transforms,
     write_videos,
 )
+from tests.data.made_videos import write_plain
 
 LENS = [-0.25, 0.08, 0.004, -0.003, 0.02]
 SIZES = [(45, 30), (48, 32), (41, 27)]
@@ -297,6 +299,38 @@ def test_videos_units_and_pixel_centres(tmp_path):
         with pytest.raises(InputError, match=key):
             Scene.open(tmp_path)
         edit_json(tmp_path / "cameras.json", lambda content: content.pop(key))
+
+
+MISTAKES = {
+    "pixel_centre": ({"pixel_centre": 0}, {}, "pixel_centre is no key of this file; did you mean pixel_center?"),
+    "unit": ({"unit": "mm"}, {}, "unit is no key of this file; did you mean units?"),
+    "distorsion": ({}, {"distorsion": [0.1, 0, 0, 0]}, "distorsion is"),
+    "units of a camera": ({}, {"units": "mm"}, "camera .*: units belongs to the top level"),
+    "near of a camera": ({}, {"near": 2.0}, "camera .*: near belongs to the top level"),
+}
+
+
+@pytest.mark.parametrize("kind", MISTAKES)
+def test_videos_keys_are_not_ignored(tmp_path, kind):
+    top, own, message = MISTAKES[kind]
+    folder = write_videos(tmp_path, make_scene())
+    edit_json(folder / "cameras.json", lambda content: (content.update(top), content["cameras"][1].update(own)))
+    with pytest.raises(InputError, match="cameras.json: .*" + message):
+        Scene.open(folder)
+
+
+def test_videos_keys_of_all_cameras_may_be_at_the_top(tmp_path):
+    folder = write_videos(tmp_path, make_scene())
+    edit_json(folder / "cameras.json", lambda content: content.update(k1=0.1, author="me", frames=4))
+    assert all(lens.coefficients[0] == 0.1 for lens in Scene.open(folder).recording.distortions)
+
+
+def test_video_names_of_cameras_and_other_systems(tmp_path):
+    folder = write_videos(tmp_path, make_scene())
+    shutil.rmtree(folder / "cam_0")
+    made = write_plain(folder / "cam_0.mp4", 4, 12, (48, 32))
+    made.rename(folder / "cam_0.MP4")
+    assert Scene.open(folder).images([0], [0]).shape == (1, 1, 3, 32, 48)
 
 
 def test_image_cache_files_equal_videos(odd, tmp_path):
