@@ -31,8 +31,8 @@ FISHEYE = {
 }
 # Other names of lens models and coefficients, compared without case, underscores and hyphens. Set values are an error.
 OTHER_KEY = re.compile(
-    r"[sbp][1-4]|sx1|sy1|tau[xy]|omega|xi|skew|k[1-6]|kappa\d?|d|dist|distcoef.*|radial|tangential|lens(coef.*|params)?|"
-    r".*(distort|fisheye|equirect|latlong|rollingshutter|ftheta).*"
+    r"[sbp][1-4]|sx1|sy1|tau[xy]|omega|xi|skew|k[1-6]|kappa\d?|d|dist|distcoef.*|radial|tangential|"
+    r"lens(coef.*|params)?|.*(distort|fisheye|equirect|latlong|rollingshutter|ftheta).*"
 )
 MODEL_KEY = re.compile(r"(camera|lens|projection|distortion)?(type|model|mode|projection)|lens")
 OTHER_MODEL = re.compile(r"fish|equi|omni|ftheta|spher|panoram|latlong|kannala|prism|^(kb\d?|mei|ds|eucm|ucm|fov)$")

@@ -103,7 +103,7 @@ def test_transforms_focal_lengths_agree_with_angles(tmp_path):
     edit_json(tmp_path / "transforms.json", lambda content: content.update(camera_angle_x=0.3))  # frames have fl_x
     assert Scene.open(tmp_path).n_steps == 4
     edit_json(tmp_path / "transforms.json", lambda content: content["frames"][0].update(camera_angle_x=0.3))
-    with pytest.raises(InputError, match=r"frame 0: fl_x is 5\d.*, but 158.* by camera_angle_x; remove one"):
+    with pytest.raises(InputError, match=r"fl_x is 5\d.*, but 158.* by camera_angle_x; remove one"):
         Scene.open(tmp_path)
 
 

@@ -325,12 +325,12 @@ def test_videos_keys_of_all_cameras_may_be_at_the_top(tmp_path):
     assert all(lens.coefficients[0] == 0.1 for lens in Scene.open(folder).recording.distortions)
 
 
-def test_video_names_of_cameras_and_other_systems(tmp_path):
+def test_names_of_videos_may_end_in_capitals(tmp_path):
     folder = write_videos(tmp_path, make_scene())
     shutil.rmtree(folder / "cam_0")
-    made = write_plain(folder / "cam_0.mp4", 4, 12, (48, 32))
-    made.rename(folder / "cam_0.MP4")
-    assert Scene.open(folder).images([0], [0]).shape == (1, 1, 3, 32, 48)
+    edit_json(folder / "cameras.json", lambda content: content.update(masks="none", cameras=content["cameras"][:1]))
+    write_plain(folder / "cam_0.mp4", 4, 24, (48, 32)).rename(folder / "cam_0.MP4")
+    assert Scene.open(folder).images([0], range(4)).shape == (4, 1, 3, 32, 48)
 
 
 def test_image_cache_files_equal_videos(odd, tmp_path):
