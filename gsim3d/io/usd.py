@@ -20,7 +20,7 @@ import numpy as np
 
 from gsim3d.errors import InputError
 from gsim3d.io import usd_child
-from gsim3d.io.arrays import FIELDS, Y_TO_Z_UP, Splats, read_head, turned
+from gsim3d.io.arrays import FIELDS, Y_TO_Z_UP, Splats, joined, placed, read_head, turned
 from gsim3d.io.files import whole_file
 
 
@@ -75,8 +75,9 @@ def read(path: Path) -> Splats:
     unit = found["unit"]
     if not 0 < unit < np.inf:
         raise InputError(f"{path}: metersPerUnit must be positive; got {unit}")
-    means, quats, scales, opacities, sh = (found[name] for name in usd_child.FIELDS)
-    whole = Splats(means * unit, quats, scales * unit, opacities, sh)
+    columns = (np.split(found[name], found["counts"].cumsum()[:-1]) for name in usd_child.FIELDS)
+    parts = [placed(Splats(*part), place, path) for *part, place in zip(*columns, found["places"])]
+    whole = placed(joined(parts, path), np.diag([unit, unit, unit, 1.0]), path)
     return turned(whole, Y_TO_Z_UP) if found["is_y_up"] else whole
 
 

@@ -38,20 +38,26 @@ def main(file: str, out: str) -> None:
 
 
 def read(file: str) -> dict[str, np.ndarray]:
-    """Arrays of all Gaussians at the first time, as they stand, by FIELDS; whether y points up, and metres a unit."""
+    """Arrays of all fields at the first time, joined, by FIELDS; for each its count and its transform, float64 [4, 4].
+
+    Also whether y points up, and metres a unit.
+    """
     from pxr import Usd, UsdGeom
 
     stage = Usd.Stage.Open(file)
     time = Usd.TimeCode(stage.GetStartTimeCode()) if stage.HasAuthoredTimeCodeRange() else Usd.TimeCode.EarliestTime()
     fields = [prim for prim in stage.Traverse() if prim.GetTypeName() == TYPE]
-    parts = [_arrays(prim, time) for prim in fields if UsdGeom.Imageable(prim).ComputeVisibility(time) != "invisible"]
+    fields = [prim for prim in fields if UsdGeom.Imageable(prim).ComputeVisibility(time) != "invisible"]
+    parts = [_arrays(prim, time) for prim in fields]
     if not parts:
         raise Refused(f"no visible prim is a {TYPE}")
     if len({part[-1].shape[1:] for part in parts}) > 1:
         raise Refused("its fields have different degrees of harmonics")
     found = {name: np.concatenate(arrays) for name, arrays in zip(FIELDS, zip(*parts))}
+    found["counts"], places = np.array([len(part[0]) for part in parts]), UsdGeom.XformCache(time)
+    found["places"] = np.array([np.array(places.GetLocalToWorldTransform(prim)).T for prim in fields])
     is_y_up = UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y
-    return found | {"is_y_up": np.array(is_y_up), "unit": np.float32(UsdGeom.GetStageMetersPerUnit(stage))}
+    return found | {"is_y_up": np.array(is_y_up), "unit": np.array(UsdGeom.GetStageMetersPerUnit(stage))}
 
 
 def _arrays(prim, time) -> list[np.ndarray]:

@@ -118,6 +118,28 @@ def test_usd_of_changing_counts_stores_what_rests_once(tmp_path):
     assert [len(prim.GetAttribute("positions").GetTimeSamples()) for prim in prims] == [0, 0, 0, 3]
 
 
+def test_usd_transforms_are_applied(tmp_path):
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    from pxr import Gf, Usd, UsdGeom
+
+    given = make(5, 1)
+    write_splats(tmp_path / "a.usda", given)
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    place = UsdGeom.Xformable(stage.GetPrimAtPath("/Gaussians"))
+    place.AddTranslateOp().Set(Gf.Vec3d(5e5, 4e6, 100))
+    size = place.AddScaleOp()
+    size.Set(Gf.Vec3f(2, 2, 2))
+    stage.GetRootLayer().Save()
+    read = read_splats(tmp_path / "a.usda")
+    expected = 2 * given.means.double() + torch.tensor([5e5, 4e6, 100])
+    torch.testing.assert_close(read.means + read.world_offset, expected, rtol=0, atol=1e-5)
+    torch.testing.assert_close(read.scales, 2 * given.scales)
+    size.Set(Gf.Vec3f(2, 1, 2))
+    stage.GetRootLayer().Save()
+    with pytest.raises(InputError, match="scale alike"):
+        read_splats(tmp_path / "a.usda")
+
+
 def damaged(text):
     return [
         (text[: len(text) // 2], "not a USD file"),
