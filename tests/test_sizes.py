@@ -11,8 +11,8 @@ sizes = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(sizes)
 # What is still above its limit may shrink and not grow.
 TODAY = {
-    "lines of the package": 47_570,
-    "lines of the library without io": 17_376,
+    "lines of the package": 47_348,
+    "lines of the library without io": 17_154,
     "lines of readers, writers and the viewer": 4_637,
 }
 

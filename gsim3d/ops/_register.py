@@ -22,9 +22,16 @@ _library = torch.library.Library("gsim3d", "FRAGMENT")
 _functions: dict[str, type[torch.autograd.Function]] = {}
 
 
-def fake(name: str) -> Callable[[Callable], Callable]:
-    """A decorator: the function makes the results of gsim3d::``name`` without computing them."""
-    return torch.library.register_fake(f"gsim3d::{name}")
+def fakes(**functions: Callable) -> None:
+    """Registers by op what makes results of the right shapes without computing them."""
+    for name, function in functions.items():
+        torch.library.register_fake(f"gsim3d::{name}", function)
+
+
+def save_inputs(ctx: Any, inputs: Sequence[Any], output: Any) -> None:
+    """The rule ``setup`` of a gradient that reads the inputs: tensors are saved, the others are ``ctx.others``."""
+    ctx.save_for_backward(*(x for x in inputs if isinstance(x, Tensor)))
+    ctx.others = [x for x in inputs if not isinstance(x, Tensor)]
 
 
 def define(schema: str, kernel: Callable) -> None:
@@ -47,9 +54,7 @@ def register_gradients(
     """As torch.library.register_autograd, of gsim3d::``op``.
 
     Args:
-        op: name.
-        backward: of torch.
-        setup: of torch.
+        op, backward, setup: of torch.
         gradient_ops: what ``backward`` calls and what has no derivative itself.
         without: tensor arguments that have no gradient.
         jvp: (inputs, their tangents or None, outputs) -> tangents of the outputs; :func:`call` then has forward mode.
@@ -71,9 +76,7 @@ def call(op: str, *arguments: Any) -> Any:
     return getattr(torch.ops.gsim3d, op)(*arguments)
 
 
-def _function_of(
-    op: str, backward: Callable, setup: Callable, jvp: Callable | None, batched: Callable
-) -> type[torch.autograd.Function]:
+def _function_of(op: str, backward: Callable, setup: Callable, jvp: Callable | None, batched: Callable) -> type:
     overload = getattr(torch.ops.gsim3d, op)
 
     class Function(torch.autograd.Function):
@@ -92,13 +95,8 @@ def _function_of(
         @staticmethod
         def jvp(ctx, *tangents):
             if jvp is None:
-                raise GradientError(
-                    f"{op}: its gradient has no derivative in forward mode (jvp of a gradient); use reverse mode over "
-                    "reverse mode, as torch.func.jacrev",
-                    op=op,
-                    argument=None,
-                    order=2,
-                )
+                said = "no derivative in forward mode (jvp of a gradient); use reverse mode over reverse mode, as"
+                raise GradientError(f"{op}: its gradient has {said} torch.func.jacrev", op=op, argument=None, order=2)
             tensors, others = iter(ctx.saved_tensors), iter(ctx.others)
             inputs = [next(tensors if is_tensor else others) for is_tensor in ctx.is_tensor]
             return jvp(inputs, tangents, tuple(tensors))
@@ -113,6 +111,12 @@ def _function_of(
     Function.backward = staticmethod(backward)
     Function.__name__ = Function.__qualname__ = op
     return Function
+
+
+def expanded(size: int, inputs: Sequence[Any], is_batched: Sequence[bool]) -> list[Any]:
+    """Tensors or None, each tensor with the batch in front."""
+    pairs = zip(inputs, is_batched, strict=True)
+    return [x if has or x is None else x.expand(size, *x.shape) for x, has in pairs]
 
 
 def one_by_one(op: str) -> Callable:
@@ -214,19 +218,14 @@ def _refuse_transforms(op: str, arguments: Sequence[Any]) -> None:
     if not torch._C._are_functorch_transforms_active() or torch.compiler.is_compiling() or not torch.is_grad_enabled():
         return
     if any(isinstance(x, Tensor) and x.requires_grad for x in arguments):
-        raise GradientError(
-            f"{op}: has no transforms of torch.func; use torch.autograd.grad", op=op, argument=None, order=1
-        )
+        said = "has no transforms of torch.func; use torch.autograd.grad"
+        raise GradientError(f"{op}: {said}", op=op, argument=None, order=1)
 
 
 def _second_derivative_of(op: str) -> Callable:
     def backward(ctx, *_):
-        raise GradientError(
-            f"{op}: its arguments have no second derivative (order 2): its gradient cannot be differentiated; "
-            "detach it, or leave create_graph=True out",
-            op=op,
-            argument=None,
-            order=2,
-        )
+        said = "its arguments have no second derivative (order 2): its gradient cannot be differentiated; "
+        said += "detach it, or leave create_graph=True out"
+        raise GradientError(f"{op}: {said}", op=op, argument=None, order=2)
 
     return backward

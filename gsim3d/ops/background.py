@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.ops._arguments import check_numbers, check_tensors, check_whole
-from gsim3d.ops._register import fake, register_autocast, register_gradients
+from gsim3d.ops._register import fakes, register_autocast, register_gradients
 from gsim3d.ops.curve import PatchTable, Segments
 
 RUN = 64  # rows that are summed one after another
@@ -136,19 +136,18 @@ def overlapping_patches(
     return tuple(PatchTable(*lists) for lists in zip(*(table.unbind() for table in tables), strict=True))
 
 
-@fake("row_scenes")
-def _(cloud_scene, cu_input, rows, cu_rows):
-    return [cloud_scene.new_empty(cu.shape[0] - 1) for cu in cu_rows]
+def _patches(first, kv_rows, cu_k, codes, order, cu_clouds, patch_size):
+    curves, n_parts = first.shape[0], first.shape[1] + codes.shape[1] // patch_size
+    sizes = (codes.shape[1], kv_rows.shape[1] + codes.shape[1], n_parts + 1, n_parts + 1)
+    return tuple(first.new_empty(curves, size) for size in sizes)
 
 
-@fake("find_cells")
-def _(cells, scene, grid):
-    return cells.new_empty(scene.shape)
-
-
-@fake("add_cells")
-def _(x, field, places):
-    return x.new_empty(x.shape)
+fakes(
+    row_scenes=lambda cloud_scene, cu_input, rows, cu_rows: [cloud_scene.new_empty(cu.shape[0] - 1) for cu in cu_rows],
+    find_cells=lambda cells, scene, grid: cells.new_empty(scene.shape),
+    add_cells=lambda x, field, places: x.new_empty(x.shape),
+    overlapping_patches=_patches,
+)
 
 
 def _setup(ctx, inputs, output):
@@ -172,12 +171,5 @@ def _sum_by_cell(x: Tensor, places: Tensor, n_cells: int) -> Tensor:
     return torch.ops.gsim3d.unpool_backward(runs, each, torch.searchsorted(cuts, cu_cells)).to(x.dtype)
 
 
-register_gradients("add_cells", _backward, _setup, gradient_ops=[])
+register_gradients("add_cells", _backward, _setup)
 register_autocast("add_cells", "follow")
-
-
-@fake("overlapping_patches")
-def _(first, kv_rows, cu_k, codes, order, cu_clouds, patch_size):
-    curves, n_parts = first.shape[0], first.shape[1] + codes.shape[1] // patch_size
-    sizes = (codes.shape[1], kv_rows.shape[1] + codes.shape[1], n_parts + 1, n_parts + 1)
-    return tuple(first.new_empty(curves, size) for size in sizes)

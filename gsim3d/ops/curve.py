@@ -13,10 +13,11 @@ from torch import Tensor
 
 from gsim3d.ops import _neighbours as neighbours
 from gsim3d.ops._arguments import check_real, check_tensors, check_whole
-from gsim3d.ops._register import fake
+from gsim3d.ops._register import fakes
 from gsim3d.ops.streams import MANY_STREAMS, Streams
 
 CURVES = ("z", "z-trans", "hilbert", "hilbert-trans")
+N_COUNTS = 4  # of a stage that are found: rows, clouds, patches, keys
 
 
 def curve_encode(
@@ -50,9 +51,8 @@ def curve_encode(
         tensor([4, 2, 1])
     """
     check_tensors("curve_encode", grid=grid, **({} if cloud is None else {"cloud": cloud}))
-    check_whole("curve_encode", depth=depth, **({} if shift is None else {"shift": shift}))
-    if not torch.compiler.is_compiling() and not 1 <= depth <= 16:
-        raise ValueError(f"curve_encode: depth must be in [1, 16]; got {depth}")
+    check_whole("curve_encode", **({} if shift is None else {"shift": shift}))
+    _check_depth("curve_encode", depth)
     names = (curve,) if isinstance(curve, str) else curve
     if not isinstance(names, Sequence):
         raise TypeError(f"curve_encode: curve must be a name or several; got {curve!r}")
@@ -335,7 +335,6 @@ class PyramidCapacity:
     n_stages: int
     sizes: tuple[int, ...]
 
-    COUNTS = ("rows", "clouds", "patches", "keys")  # of a stage
     MALFORMED, TOO_LARGE = 7, 8  # bits of Pyramid.found[0]
 
     @classmethod
@@ -363,15 +362,14 @@ class PyramidCapacity:
         """
         wanted = [math.ceil(factor * count) for count in found[1:]]
         n_rows = self.sizes[0] if found[1] <= self.sizes[0] else wanted[0]
-        for rows in range(0, self.n_stages * len(self.COUNTS), len(self.COUNTS)):
+        for rows in range(0, N_COUNTS * self.n_stages, N_COUNTS):
             wanted[rows] = min(wanted[rows], n_rows)  # no stage has more rows than go in
         return PyramidCapacity(self.n_stages, tuple(max(a, b) for a, b in zip(self.sizes, wanted, strict=True)))
 
     def of_rows(self, n_rows: int) -> PyramidCapacity:
         """This capacity where no more than ``n_rows`` rows go in."""
-        n_counts = self.n_stages * len(self.COUNTS)
-        is_rows = [i < n_counts and i % len(self.COUNTS) == 0 for i in range(len(self.sizes))]
-        sizes = (min(size, n_rows) if rows else size for size, rows in zip(self.sizes, is_rows, strict=True))
+        of_rows = range(0, N_COUNTS * self.n_stages, N_COUNTS)
+        sizes = (min(size, n_rows) if i in of_rows else size for i, size in enumerate(self.sizes))
         return PyramidCapacity(self.n_stages, tuple(sizes))
 
     def fits(self, found: Sequence[int]) -> bool:
@@ -383,10 +381,8 @@ class PyramidCapacity:
             ValueError: the clouds of the call were malformed, which on CUDA is known only now.
         """
         if found[0] & self.MALFORMED:
-            raise ValueError(
-                "build_pyramid: cu_rows, cloud_scene, cloud_slot or origin is malformed; a call without "
-                "capacity names it"
-            )
+            names = "cu_rows, cloud_scene, cloud_slot or origin"
+            raise ValueError(f"build_pyramid: {names} is malformed; a call without capacity names it")
         return not found[0] & self.TOO_LARGE
 
 
@@ -456,39 +452,30 @@ def build_pyramid(
         _check_spec(spec, curves)
         if not (capacity is None or isinstance(capacity, PyramidCapacity)):
             raise TypeError(f"build_pyramid: capacity must be a PyramidCapacity; got {type(capacity).__name__}")
-        check_whole("build_pyramid", **({} if depth is None else {"depth": depth}))
-        if depth is not None and not 1 <= depth <= 16:
-            raise ValueError(f"build_pyramid: depth must be in [1, 16]; got {depth}")
+        if depth is not None:
+            _check_depth("build_pyramid", depth)
         if not isinstance(rounded, bool):
             raise TypeError(f"build_pyramid: rounded must be true or false; got {rounded!r}")
     if curves is None:
         curves = ((0, 1, 2, 3),) * spec.n_stages
     cu_kernels = list(accumulate(map(len, spec.kernel_sizes), initial=0))
+    flat_curves, flat_sizes = ([value for row in rows for value in row] for rows in (curves, spec.kernel_sizes))
     arrays = torch.ops.gsim3d.build_pyramid(
-        positions.detach(),
-        cu_rows,
-        cloud_scene,
-        cloud_slot,
-        origin,
-        spec.grid_size,
-        spec.slot_bits,
-        spec.strides,
-        spec.merge_windows,
-        spec.patch_sizes,
-        [curve for row in curves for curve in row],
-        [size for sizes in spec.kernel_sizes for size in sizes],
-        cu_kernels,
-        spec.release,
-        () if capacity is None else capacity.sizes,
-        rounded,
-        depth or 0,
+        *(positions.detach(), cu_rows, cloud_scene, cloud_slot, origin, spec.grid_size, spec.slot_bits, spec.strides),
+        *(spec.merge_windows, spec.patch_sizes, flat_curves, flat_sizes, cu_kernels, spec.release),
+        *(() if capacity is None else capacity.sizes, rounded, depth or 0),
     )
     counts = None
     if rounded and not torch.compiler.is_compiling():
-        each = len(PyramidCapacity.COUNTS)
-        counts = arrays[-1].tolist()[1 : 1 + each * spec.n_stages : each]
+        counts = arrays[-1].tolist()[1:][: N_COUNTS * spec.n_stages : N_COUNTS]
     with Streams(positions, MANY_STREAMS) as streams:
         return _assemble(arrays, spec, counts, capacity is not None or rounded, streams)
+
+
+def _check_depth(op: str, depth: int) -> None:
+    check_whole(op, depth=depth)
+    if not torch.compiler.is_compiling() and not 1 <= depth <= 16:
+        raise ValueError(f"{op}: depth must be in [1, 16]; got {depth}")
 
 
 def _check_spec(spec: PyramidSpec, curves: tuple[tuple[int, ...], ...] | None) -> None:
@@ -542,37 +529,9 @@ def _assemble(
     return Pyramid(rows, cu_rows, tuple(stages), take() if has_found else None)
 
 
-@fake("curve_encode")
-def _(grid, cloud, curves, depth, shift):
-    return grid.new_empty(len(curves), grid.shape[0])
-
-
-@fake("curve_sort")
-def _(codes):
-    return codes.new_empty(codes.shape), codes.new_empty(codes.shape)
-
-
-@fake("build_pyramid")
-def _(
-    positions,
-    cu_rows,
-    cloud_scene,
-    cloud_slot,
-    origin,
-    grid_size,
-    slot_bits,
-    strides,
-    merge_windows,
-    patch_sizes,
-    curves,
-    kernel_sizes,
-    cu_kernels,
-    release,
-    capacity,
-    rounded=False,
-    depth=0,
-):
-    n_counts = len(PyramidCapacity.COUNTS) * len(patch_sizes)
+def _pyramid(positions, cu_rows, cloud_scene, cloud_slot, origin, grid_size, slot_bits, strides, merge_windows, *rest):
+    patch_sizes, _, kernel_sizes, cu_kernels, _, capacity, *rounded_and_depth = rest
+    n_counts = N_COUNTS * len(patch_sizes)
     of_stages, of_maps = iter(capacity[:n_counts]), iter(capacity[n_counts:])
 
     def size(given=of_stages, more=0):  # one symbol: an unbacked size must be the whole size of some result
@@ -593,6 +552,13 @@ def _(
         for kernel_size in kernel_sizes[cu_kernels[s] : cu_kernels[s + 1]]:
             n_pairs = size(of_maps)
             arrays += [(n_pairs,), (n_pairs,), (kernel_size**3 + 1,)]
-    if capacity or rounded:
+    if capacity or any(rounded_and_depth[:1]):
         arrays.append((1 + n_counts + len(kernel_sizes),))
     return [cu_rows.new_empty(shape) for shape in arrays]
+
+
+fakes(
+    curve_encode=lambda grid, cloud, curves, depth, shift: grid.new_empty(len(curves), grid.shape[0]),
+    curve_sort=lambda codes: (codes.new_empty(codes.shape), codes.new_empty(codes.shape)),
+    build_pyramid=_pyramid,
+)

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.ops._arguments import check_numbers, check_real, check_tensors, check_whole
-from gsim3d.ops._register import fake, is_narrow, register_autocast, register_gradients
+from gsim3d.ops._register import fakes, is_narrow, register_autocast, register_gradients, save_inputs
 
 LARGEST_READING = 1e3  # cubes of readings times the largest ``raw`` stay finite; those of the table are below 2
 
@@ -47,29 +47,18 @@ def decode_gaussians(
     return torch.ops.gsim3d.decode_gaussians(raw, readings, degree, scale_min, scale_max)
 
 
-@fake("decode_gaussians")
-def _(raw, readings, degree, scale_min, scale_max):
-    n = raw.shape[0]
-    return readings.new_empty(n, 4), readings.new_empty(n, 3), readings.new_empty(n, (degree + 1) ** 2, 3)
-
-
-@fake("decode_gaussians_backward")
-def _(grad_quats, grad_scales, grad_sh, raw, readings, degree, scale_min, scale_max):
-    return raw.new_empty(raw.shape)
-
-
-def _setup(ctx, inputs, output):
-    raw, readings, *ctx.numbers = inputs
-    ctx.save_for_backward(raw, readings)
+def _decoded(raw, readings, degree, scale_min, scale_max):
+    return tuple(readings.new_empty(raw.shape[0], *sizes) for sizes in ((4,), (3,), ((degree + 1) ** 2, 3)))
 
 
 def _backward(ctx, *grads):
-    grad_raw = torch.ops.gsim3d.decode_gaussians_backward(*grads, *ctx.saved_tensors, *ctx.numbers)
+    grad_raw = torch.ops.gsim3d.decode_gaussians_backward(*grads, *ctx.saved_tensors, *ctx.others)
     return grad_raw, None, None, None, None
 
 
+fakes(decode_gaussians=_decoded, decode_gaussians_backward=lambda *inputs: inputs[3].new_empty(inputs[3].shape))
 _gradient_ops = ["decode_gaussians_backward"]
-register_gradients("decode_gaussians", _backward, _setup, gradient_ops=_gradient_ops, without=["readings"])
+register_gradients("decode_gaussians", _backward, save_inputs, gradient_ops=_gradient_ops, without=["readings"])
 
 
 def _autocast(device, arguments):

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from gsim3d.ops._arguments import as_given, check_numbers, check_real, check_tensors, widened_on_cpu
 from gsim3d.ops._attention_derivatives import gradients_of_gradients, tangent
-from gsim3d.ops._register import call, define, fake, one_by_one, register_autocast, register_gradients
+from gsim3d.ops._register import call, define, expanded, fakes, one_by_one, register_autocast, register_gradients
 from gsim3d.ops.curve import PatchTable
 
 
@@ -129,12 +129,6 @@ def _scale(q: Tensor, scale: float | None) -> float:
     return q.shape[-1] ** -0.5 if q.dim() and q.shape[-1] else 1.0
 
 
-@fake("patch_attention")
-def _(q, k, v, q_rows, kv_rows, cu_q, cu_k, scale):
-    stats_dtype = torch.promote_types(q.dtype, torch.float32)
-    return q.new_empty(q.shape), q.new_empty(q.shape[0], q.shape[1], 2, dtype=stats_dtype)
-
-
 # The same computation; what it returns there is not the whole gradient, so that it has none itself.
 define(
     str(torch.ops.gsim3d.patch_attention_backward.default._schema).replace("gsim3d::patch", "joint", 1),
@@ -147,20 +141,23 @@ define(
 )
 
 
-@fake("attention_log_sum_exp")
-def _(stats, q, k, q_rows, kv_rows, cu_q, cu_k, scale):
-    return stats.new_empty(stats.shape[:2])
+def _attention(q, *_):
+    stats_dtype = torch.promote_types(q.dtype, torch.float32)
+    return q.new_empty(q.shape), q.new_empty(q.shape[0], q.shape[1], 2, dtype=stats_dtype)
 
 
-@fake("joint_attention_backward")
-@fake("patch_attention_backward")
-def _(grad, q, k, v, out, stats, q_rows, kv_rows, cu_q, cu_k, scale):
+def _attention_gradients(grad, q, k, *_):
     return q.new_empty(q.shape), k.new_empty(k.shape), k.new_empty(k.shape)
 
 
-@fake("patch_attention_backward_packed")
-def _(grad, q, k, v, out, stats, q_rows, kv_rows, cu_q, cu_k, scale):
-    return q.new_empty(q.shape[0], 3, *q.shape[1:])
+fakes(
+    patch_attention=_attention,
+    patch_attention_backward=_attention_gradients,
+    patch_attention_backward_packed=lambda grad, q, *_: q.new_empty(q.shape[0], 3, *q.shape[1:]),
+    joint_attention=_attention,
+    joint_attention_backward=_attention_gradients,
+    attention_log_sum_exp=lambda stats, *_: stats.new_empty(stats.shape[:2]),
+)
 
 
 def _setup(ctx, inputs, output):
@@ -197,7 +194,7 @@ def _batched(op: str, n_floats: int):
     def batched(size, inputs, is_batched):
         if any(is_batched[n_floats:]):
             return one_by_one(op)(size, inputs, is_batched)
-        floats = [x if has else x.expand(size, *x.shape) for x, has in zip(inputs[:n_floats], is_batched)]
+        floats = expanded(size, inputs[:n_floats], is_batched[:n_floats])
         q, k = (floats[0], floats[1]) if n_floats == 3 else (floats[1], floats[2])
         table = _one_after_another(size, *inputs[n_floats:-1], q.shape[1], k.shape[1])
         results = call(op, *(x.flatten(0, 1) for x in floats), *table, inputs[-1])
@@ -240,12 +237,6 @@ def _lse_jvp(inputs, tangents, outputs):
     return total
 
 
-@fake("joint_attention")
-def _(q, k, v, other_k, other_v, *lists_and_scale):
-    stats_dtype = torch.promote_types(q.dtype, torch.float32)
-    return q.new_empty(q.shape), q.new_empty(q.shape[0], q.shape[1], 2, dtype=stats_dtype)
-
-
 def _joint_setup(ctx, inputs, output):
     ctx.set_materialize_grads(False)
     ctx.mark_non_differentiable(output[1])
@@ -265,25 +256,12 @@ def _joint_backward(ctx, grad, _grad_stats):
     return own[0] + other[0], *own[1:], *other[1:], *(None,) * 9
 
 
-register_gradients(
-    "patch_attention",
-    _backward,
-    _setup,
-    gradient_ops=["patch_attention_backward_packed"],
-    jvp=_jvp,
-    batched=_batched("patch_attention", 3),
-)
-register_gradients(
-    "patch_attention_backward", _gradient_backward, _gradient_setup, batched=_batched("patch_attention_backward", 6)
-)
-register_gradients(
-    "attention_log_sum_exp",
-    _lse_backward,
-    _lse_setup,
-    jvp=_lse_jvp,
-    batched=one_by_one("attention_log_sum_exp"),
-)
+_op, _gradient, _lse = "patch_attention", "patch_attention_backward", "attention_log_sum_exp"
+_packed = [f"{_gradient}_packed"]
+register_gradients(_op, _backward, _setup, gradient_ops=_packed, jvp=_jvp, batched=_batched(_op, 3))
+register_gradients(_gradient, _gradient_backward, _gradient_setup, batched=_batched(_gradient, 6))
+register_gradients(_lse, _lse_backward, _lse_setup, jvp=_lse_jvp, batched=one_by_one(_lse))
 register_gradients("joint_attention", _joint_backward, _joint_setup, gradient_ops=["joint_attention_backward"])
-for _name in ("patch_attention", "joint_attention"):
-    register_autocast(_name, "follow")
-register_autocast("attention_log_sum_exp", "float32")
+register_autocast(_op, "follow")
+register_autocast("joint_attention", "follow")
+register_autocast(_lse, "float32")

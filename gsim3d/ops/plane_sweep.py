@@ -5,7 +5,7 @@ from torch import Tensor
 
 from gsim3d.errors import NumericalError
 from gsim3d.ops._arguments import check_floating, check_numbers, check_tensors
-from gsim3d.ops._register import fake, register_autocast, register_gradients
+from gsim3d.ops._register import fakes, register_autocast, register_gradients, save_inputs
 
 
 def sweep_geometry(
@@ -137,19 +137,11 @@ def plane_sweep(
     return torch.ops.gsim3d.plane_sweep(features, homographies, translations, inverse_depths, src_images, cu_src)
 
 
-@fake("plane_sweep")
-def _(features, homographies, translations, inverse_depths, src_images, cu_src):
-    n_images, _, height, width = features.shape
-    return features.new_empty(n_images, inverse_depths.shape[1], height, width)
+def _costs(features, homographies, translations, inverse_depths, src_images, cu_src):
+    return features.new_empty(features.shape[0], inverse_depths.shape[1], *features.shape[2:])
 
 
-@fake("plane_sweep_backward")
-def _(grad, features, homographies, translations, inverse_depths, src_images, cu_src):
-    return features.new_empty(features.shape)
-
-
-def _setup(ctx, inputs, output):
-    ctx.save_for_backward(*inputs)
+fakes(plane_sweep=_costs, plane_sweep_backward=lambda grad, features, *_: features.new_empty(features.shape))
 
 
 def _backward(ctx, grad):
@@ -157,5 +149,5 @@ def _backward(ctx, grad):
 
 
 _without = ["homographies", "translations", "inverse_depths"]
-register_gradients("plane_sweep", _backward, _setup, gradient_ops=["plane_sweep_backward"], without=_without)
+register_gradients("plane_sweep", _backward, save_inputs, gradient_ops=["plane_sweep_backward"], without=_without)
 register_autocast("plane_sweep", "float32")

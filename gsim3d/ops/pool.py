@@ -5,7 +5,15 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from gsim3d.ops._arguments import as_given, check_numbers, check_tensors, check_whole, widened, within_memory
-from gsim3d.ops._register import call, fake, folded_segments, one_by_one, register_autocast, register_gradients
+from gsim3d.ops._register import (
+    call,
+    expanded,
+    fakes,
+    folded_segments,
+    one_by_one,
+    register_autocast,
+    register_gradients,
+)
 
 
 def pool_max(x: Tensor, rows: Tensor, cu_rows: Tensor, *, check: bool = True) -> Tensor:
@@ -36,8 +44,7 @@ def pool_max(x: Tensor, rows: Tensor, cu_rows: Tensor, *, check: bool = True) ->
                 [3.]])
     """
     if check:
-        check_tensors("pool_max", x=x, rows=rows, cu_rows=cu_rows)
-        check_numbers("pool_max", x=x)
+        _check("pool_max", x, rows, cu_rows)
     return as_given(call("pool_max", widened(x), rows, cu_rows)[0], x)
 
 
@@ -45,10 +52,7 @@ def pool_mean(x: Tensor, rows: Tensor, cu_rows: Tensor, *, check: bool = True) -
     """Mean over segments of rows; 0 where a segment is empty.
 
     Args:
-        x: features [N, C], floating point; 16-bit ones are computed in float32.
-        rows: int64 [R], as in :func:`pool_max`.
-        cu_rows: int64 [M + 1], as in :func:`pool_max`.
-        check: as in :func:`pool_max`.
+        x, rows, cu_rows, check: as in :func:`pool_max`.
     Returns:
         [M, C], dtype of ``x``.
     Gradients:
@@ -61,8 +65,7 @@ def pool_mean(x: Tensor, rows: Tensor, cu_rows: Tensor, *, check: bool = True) -
         tensor([[3.]])
     """
     if check:
-        check_tensors("pool_mean", x=x, rows=rows, cu_rows=cu_rows)
-        check_numbers("pool_mean", x=x)
+        _check("pool_mean", x, rows, cu_rows)
     return as_given(call("pool_mean", widened(x), rows, cu_rows), x)
 
 
@@ -86,49 +89,40 @@ def unpool(x: Tensor, rows: Tensor, cu_rows: Tensor, n_rows: int, *, check: bool
                 [0.]])
     """
     if check:
-        check_tensors("unpool", x=x, rows=rows, cu_rows=cu_rows)
         check_whole("unpool", n_rows=n_rows)
-        check_numbers("unpool", x=x)
+        _check("unpool", x, rows, cu_rows)
     out = within_memory("unpool", f"n_rows={n_rows}", call, "unpool", widened(x), rows, cu_rows, n_rows)
     return as_given(out, x)
 
 
-@fake("pool_max")
-def _(x, rows, cu_rows):
+def _check(op: str, x: Tensor, rows: Tensor, cu_rows: Tensor) -> None:
+    check_tensors(op, x=x, rows=rows, cu_rows=cu_rows)
+    check_numbers(op, x=x)
+
+
+def _maxima(x, rows, cu_rows):
     shape = (cu_rows.shape[0] - 1, x.shape[1])
     return x.new_empty(shape), x.new_empty(shape, dtype=torch.int64)
 
 
-@fake("pool_max_backward")
-def _(grad, argmax, n_rows):
-    return grad.new_empty(n_rows, grad.shape[1])
-
-
-@fake("pool_mean")
-def _(x, rows, cu_rows):
+def _of_segments(x, rows, cu_rows, *_):
     return x.new_empty(cu_rows.shape[0] - 1, x.shape[1])
 
 
-@fake("pool_mean_backward")
-def _(grad, rows, cu_rows, n_rows):
-    return grad.new_empty(n_rows, grad.shape[1])
+def _of_rows(x, *lists_and_n_rows):
+    return x.new_empty(lists_and_n_rows[-1], x.shape[1])
 
 
-@fake("unpool")
-def _(x, rows, cu_rows, n_rows):
-    return x.new_empty(n_rows, x.shape[1])
-
-
-@fake("unpool_backward")
-def _(grad, rows, cu_rows):
-    return grad.new_empty(cu_rows.shape[0] - 1, grad.shape[1])
-
+fakes(
+    pool_max=_maxima,
+    pool_max_backward=_of_rows,
+    pool_mean=_of_segments,
+    pool_mean_backward=_of_rows,
+    unpool=_of_rows,
+    unpool_backward=_of_segments,
+)
 
 # Each op below is linear in its features, once the rows of maxima are known; a gradient is an op of this list again.
-
-
-def _first(x: Tensor, is_batched: bool, size: int) -> Tensor:
-    return x if is_batched else x.expand(size, *x.shape)
 
 
 def _setup_lists(ctx, inputs, output):
@@ -167,7 +161,7 @@ def _pool_max_gradient_backward(ctx, grad):
 
 
 def _pool_max_gradient_batched(size, inputs, is_batched):
-    (grad, argmax), n_rows = map(_first, inputs[:2], is_batched, (size, size)), inputs[2]
+    (grad, argmax), n_rows = expanded(size, inputs[:2], is_batched[:2]), inputs[2]
     first = n_rows * torch.arange(size, device=argmax.device)[:, None, None]
     argmax = torch.where(argmax < 0, argmax, argmax + first)
     grad_x = call("pool_max_backward", grad.flatten(0, 1), argmax.flatten(0, 1), size * n_rows)
@@ -200,29 +194,17 @@ def _batched_lists(op, has_segments: bool, gives_segments: bool):
     return batched
 
 
-def _unpool_backward(ctx, grad):
-    return call("unpool_backward", grad, *ctx.saved_tensors), None, None, None
+def _to_rows(op: str):
+    """The gradient of sums over segments, or of means: ``op``."""
+    return lambda ctx, grad: (call(op, grad, *ctx.saved_tensors, ctx.n_rows), None, None)
 
 
-def _segment_sum_backward(ctx, grad):
-    return call("unpool", grad, *ctx.saved_tensors, ctx.n_rows), None, None
+def _to_segments(op: str):
+    return lambda ctx, grad: (call(op, grad, *ctx.saved_tensors), None, None, None)
 
 
-def _pool_mean_backward(ctx, grad):
-    return call("pool_mean_backward", grad, *ctx.saved_tensors, ctx.n_rows), None, None
-
-
-def _pool_mean_gradient_backward(ctx, grad):
-    return call("pool_mean", grad, *ctx.saved_tensors), None, None, None
-
-
-register_gradients(
-    "pool_max",
-    _pool_max_backward,
-    _pool_max_setup,
-    jvp=_pool_max_jvp,
-    batched=_batched_lists("pool_max", False, True),
-)
+_batched = _batched_lists("pool_max", False, True)
+register_gradients("pool_max", _pool_max_backward, _pool_max_setup, jvp=_pool_max_jvp, batched=_batched)
 register_gradients(
     "pool_max_backward",
     _pool_max_gradient_backward,
@@ -231,17 +213,12 @@ register_gradients(
     batched=_pool_max_gradient_batched,
 )
 for _op, _backward, _has_segments in (
-    ("pool_mean", _pool_mean_backward, False),
-    ("pool_mean_backward", _pool_mean_gradient_backward, True),
-    ("unpool", _unpool_backward, True),
-    ("unpool_backward", _segment_sum_backward, False),
+    ("pool_mean", _to_rows("pool_mean_backward"), False),
+    ("pool_mean_backward", _to_segments("pool_mean"), True),
+    ("unpool", _to_segments("unpool_backward"), True),
+    ("unpool_backward", _to_rows("unpool"), False),
 ):
-    register_gradients(
-        _op,
-        _backward,
-        _setup_lists,
-        jvp=_linear_jvp(_op),
-        batched=_batched_lists(_op, _has_segments, not _has_segments),
-    )
+    _batched = _batched_lists(_op, _has_segments, not _has_segments)
+    register_gradients(_op, _backward, _setup_lists, jvp=_linear_jvp(_op), batched=_batched)
 for _op in ("pool_max", "pool_mean", "unpool", "unpool_backward"):
     register_autocast(_op, "float32")

@@ -11,13 +11,13 @@ from torch import Tensor
 
 from gsim3d.cameras import Cameras
 from gsim3d.ops._arguments import check_floating, check_numbers, check_real, check_tensors, check_whole, within_memory
-from gsim3d.ops._register import fake, register_autocast, register_gradients
+from gsim3d.ops._register import fakes, register_autocast, register_gradients, save_inputs
+from gsim3d.ops.raster import LARGEST, check_scene
 
 OP = "project_gaussians"
 LENSES = {"pinhole": 0, "orthographic": 1, "opencv": 2, "fisheye": 3}
 JACOBIANS = ("exact", "clamped")
 N_DISTORTION = {"opencv": (4, 5, 8), "fisheye": (4,)}  # numbers of coefficients that a lens may have
-LARGEST = 1e15
 
 
 class Projection(NamedTuple):
@@ -134,9 +134,8 @@ def project_gaussians(
         *(cameras.image_cloud, cu_rows, cu_pairs, n_pairs, cameras.width, cameras.height),
         *(near_plane, far_plane, radius_clip, dilation, LENSES[lens], jacobian == "clamped", antialiased),
     )
-    means2d, conics, depths, radii, compensations = within_memory(
-        OP, f"n_pairs={n_pairs}", torch.ops.gsim3d.project_gaussians, *args
-    )
+    made = within_memory(OP, f"n_pairs={n_pairs}", torch.ops.gsim3d.project_gaussians, *args)
+    means2d, conics, depths, radii, compensations = made
     return Projection(means2d, conics, depths, radii, compensations, cu_pairs)
 
 
@@ -214,22 +213,12 @@ def sh_to_color(directions: Tensor, sh: Tensor) -> Tensor:
 
 
 def _check(tensors: dict, cameras: Cameras, cu_rows: Tensor | None, lens: str, jacobian: str) -> None:
-    if not isinstance(cameras, Cameras):
-        raise TypeError(f"{OP}: cameras must be gsim3d.Cameras; got {type(cameras).__name__}")
-    of_cameras = {f"cameras.{name}": getattr(cameras, name) for name in ("viewmats", "Ks", "image_cloud")}
-    check_tensors(OP, **tensors, **of_cameras, **({} if cu_rows is None else {"cu_rows": cu_rows}))
-    check_floating(OP, means=tensors["means"])
-    check_whole(OP, **{f"cameras.{name}": getattr(cameras, name) for name in ("width", "height")})
+    check_scene(OP, tensors | ({} if cu_rows is None else {"cu_rows": cu_rows}), cameras)
     if ("covars" in tensors) == ("quats" in tensors or "scales" in tensors):
         raise ValueError(f"{OP}: give quats and scales, or covars")
     for name, value, known in (("lens", lens, tuple(LENSES)), ("jacobian", jacobian, JACOBIANS)):
         if value not in known:
             raise ValueError(f"{OP}: {name} must be one of {', '.join(known)}; got {value!r}")
-    shapes = {"means": "[N, 3]", "cameras.viewmats": "[I, 4, 4]", "cameras.Ks": "[I, 3, 3]"}
-    for name, shape in shapes.items():
-        tensor = (tensors | of_cameras)[name]
-        if tensor.dim() != shape.count(",") + 1:
-            raise ValueError(f"{OP}: {name} must be {shape}; got {list(tensor.shape)}")
     for name, indices in (("cameras.image_cloud", cameras.image_cloud), ("cu_rows", cu_rows)):
         if indices is not None and (indices.dtype != torch.int64 or indices.dim() != 1):
             raise ValueError(f"{OP}: {name} must be int64 and a list; got {indices.dtype} {list(indices.shape)}")
@@ -248,22 +237,14 @@ def _check(tensors: dict, cameras: Cameras, cu_rows: Tensor | None, lens: str, j
     check_numbers(OP, largest_of=LARGEST, **tensors)
 
 
-@fake("project_gaussians")
-def _(means, quats, scales, covars, opacities, viewmats, Ks, distortion, limits, *rest):
-    n_pairs = rest[3]
-    radii = means.new_empty(n_pairs, 2, dtype=torch.int32)
-    return (
-        means.new_empty(n_pairs, 2),
-        means.new_empty(n_pairs, 3),
-        means.new_empty(n_pairs),
-        radii,
-        means.new_empty(n_pairs),
-    )
+def _pairs(means, *rest):
+    n_pairs = rest[11]
+    means2d, conics, depths, compensations = (means.new_empty(n_pairs, *size) for size in ((2,), (3,), (), ()))
+    return means2d, conics, depths, means.new_empty(n_pairs, 2, dtype=torch.int32), compensations
 
 
-@fake("project_gaussians_backward")
-def _(grad_means2d, grad_conics, grad_depths, grad_compensations, radii, means, quats, scales, covars, viewmats, *rest):
-    _, distortion, *_, viewmats_grad, lens_grad = rest
+def _gradients(*inputs):  # of four outputs, then the radii
+    means, quats, scales, covars, viewmats, _, distortion, *_, viewmats_grad, lens_grad = inputs[5:]
     n, n_images = means.shape[0], viewmats.shape[0]
     n_axes, n_lens = (0 if quats is None else n), (n_images if lens_grad else 0)
     shapes = [(n, 3), (n_axes, 4), (n_axes, 3), (0 if covars is None else n, 3, 3)]
@@ -275,9 +256,8 @@ def _setup(ctx, inputs, output):
     ctx.set_materialize_grads(False)
     ctx.mark_non_differentiable(output[3])
     means, quats, scales, covars, _, viewmats, Ks, distortion, _, image_cloud, cu_rows, cu_pairs = inputs[:12]
-    ctx.save_for_backward(
-        output[3], means, quats, scales, covars, viewmats, Ks, distortion, image_cloud, cu_rows, cu_pairs
-    )
+    lists = image_cloud, cu_rows, cu_pairs
+    ctx.save_for_backward(output[3], means, quats, scales, covars, viewmats, Ks, distortion, *lists)
     n_pairs, width, height, _, _, _, dilation, lens, clamped, _ = inputs[12:]
     ctx.options = (n_pairs, width, height, dilation, lens, clamped)
 
@@ -291,43 +271,27 @@ def _backward(ctx, means2d, conics, depths, _, compensations):
         for grad, size in zip((means2d, conics, depths, compensations), sizes)
     ]
     of_viewmats, of_Ks, of_distortion = ctx.needs_input_grad[5:8]
-    grads = torch.ops.gsim3d.project_gaussians_backward(
-        *pairs, *saved, *ctx.options, of_viewmats, of_Ks or of_distortion
-    )
-    wanted = (True, saved[2] is not None, saved[3] is not None, saved[4] is not None, of_viewmats, of_Ks, of_distortion)
+    options = *ctx.options, of_viewmats, of_Ks or of_distortion
+    grads = torch.ops.gsim3d.project_gaussians_backward(*pairs, *saved, *options)
+    wanted = (True, *(x is not None for x in saved[2:5]), of_viewmats, of_Ks, of_distortion)
     means, quats, scales, covars, viewmats, Ks, distortion = (
         grad if want else None for grad, want in zip(grads, wanted, strict=True)
     )
     return means, quats, scales, covars, None, viewmats, Ks, distortion, *[None] * 14
 
 
-register_gradients(
-    "project_gaussians",
-    _backward,
-    _setup,
-    gradient_ops=["project_gaussians_backward"],
-    without=["opacities", "limits"],
-)
-register_autocast("project_gaussians", "float32")
-
-
-@fake("sh_to_color")
-def _(directions, sh):
-    return directions.new_empty(*directions.shape[:3], sh.shape[3])
-
-
-@fake("sh_to_color_backward")
-def _(grad, directions, sh):
-    return directions.new_empty(directions.shape), sh.new_empty(sh.shape)
-
-
-def _sh_setup(ctx, inputs, output):
-    ctx.save_for_backward(*inputs)
-
-
 def _sh_backward(ctx, grad):
     return torch.ops.gsim3d.sh_to_color_backward(grad, *ctx.saved_tensors)
 
 
-register_gradients("sh_to_color", _sh_backward, _sh_setup, gradient_ops=["sh_to_color_backward"])
-register_autocast("sh_to_color", "float32")
+fakes(
+    project_gaussians=_pairs,
+    project_gaussians_backward=_gradients,
+    sh_to_color=lambda directions, sh: directions.new_empty(*directions.shape[:3], sh.shape[3]),
+    sh_to_color_backward=lambda grad, *inputs: tuple(x.new_empty(x.shape) for x in inputs),
+)
+_gradient_ops = ["project_gaussians_backward"]
+register_gradients(OP, _backward, _setup, gradient_ops=_gradient_ops, without=["opacities", "limits"])
+register_gradients("sh_to_color", _sh_backward, save_inputs, gradient_ops=["sh_to_color_backward"])
+for _op in (OP, "sh_to_color"):
+    register_autocast(_op, "float32")

@@ -16,7 +16,7 @@ from gsim3d.errors import GradientError
 from gsim3d.numerics.policy import OnInvalid, check_on_invalid
 from gsim3d.numerics.report import Finding, Reading, StabilityReport
 from gsim3d.ops._arguments import check_floating, check_real, check_tensors, check_whole, within_memory
-from gsim3d.ops._register import call, fake, one_by_one, register_autocast, register_gradients
+from gsim3d.ops._register import call, expanded, fakes, one_by_one, register_autocast, register_gradients
 
 OP = "rasterize_gaussians"
 LARGEST: float = constants["raster_largest"]
@@ -144,26 +144,14 @@ def rasterize_gaussians(
     cu_rows = torch.tensor([0, n], device=means.device) if cu_rows is None else cu_rows
     watch = not compiling and _is_watched(on_invalid, report, means)
     args = (
-        *rows.values(),
-        _of_each_image(background, n_images, means, real),
-        cameras.viewmats.to(real),
-        cameras.Ks.to(real),
-        cameras.image_cloud,
-        cu_rows,
-        cameras.width,
-        cameras.height,
-        near_plane,
-        CUTOFFS[cutoff],
-        JACOBIANS[jacobian],
+        *(*rows.values(), _of_each_image(background, n_images, means, real), cameras.viewmats.to(real)),
+        *(cameras.Ks.to(real), cameras.image_cloud, cu_rows, cameras.width, cameras.height, near_plane),
+        *(CUTOFFS[cutoff], JACOBIANS[jacobian]),
         *sizes_of_state(means, n_images, cu_rows.shape[0] - 1, cameras.width, cameras.height),
-        watch,
-        *(() if active is None else [_tiles_with(active)]),
+        *(watch, *(() if active is None else [_tiles_with(active)])),
     )
-    if compiling:
-        out = torch.ops.gsim3d.rasterize_gaussians(*args)
-    else:
-        size = f"cameras.width={cameras.width}, cameras.height={cameras.height}"
-        out = within_memory(OP, size, call, OP, *args)
+    size = "" if compiling else f"cameras.width={cameras.width}, cameras.height={cameras.height}"
+    out = within_memory(OP, size, call, OP, *args)
     if watch:
         action = "error" if on_invalid == "raise" else "dropped"
         read = partial(_unusable, names=(*rows, "scales", "scales", "cameras"), action=action)
@@ -220,32 +208,35 @@ def _clamped(rows: dict[str, Tensor], report: StabilityReport | None) -> dict[st
 
 
 def _counted(counts: Tensor, names: list[str]) -> Reading:
-    return Reading(
-        [Finding("not finite or out of range", OP, name, "clamped", n) for name, n in zip(names, counts.tolist()) if n],
-        {},
-    )
+    what, found = "not finite or out of range", zip(names, counts.tolist(), strict=True)
+    return Reading([Finding(what, OP, name, "clamped", n) for name, n in found if n], {})
 
 
 def _check_arguments(
     rows: dict[str, Tensor], optional: dict[str, Tensor | None], cameras: Cameras, near_plane: float
 ) -> None:
     """Types, and the shapes that are read before the kernel checks them."""
-    if not isinstance(cameras, Cameras):
-        raise TypeError(f"rasterize_gaussians: cameras must be gsim3d.Cameras; got {type(cameras).__name__}")
     optional = {name: value for name, value in optional.items() if value is not None}
-    of_cameras = {f"cameras.{name}": getattr(cameras, name) for name in ("viewmats", "Ks", "image_cloud")}
-    check_tensors("rasterize_gaussians", **rows, **optional, **of_cameras)
-    check_floating("rasterize_gaussians", means=rows["means"])
-    check_whole("rasterize_gaussians", **{f"cameras.{name}": getattr(cameras, name) for name in ("width", "height")})
-    check_real("rasterize_gaussians", near_plane=near_plane)
-    shapes = {"means": "[N, 3]", "cameras.viewmats": "[I, 4, 4]", "cameras.Ks": "[I, 3, 3]", "cu_rows": "[Q + 1]"}
-    for name, shape in shapes.items():
-        value = rows.get(name, of_cameras.get(name, optional.get(name)))
-        if value is not None and value.dim() != shape.count(",") + 1:
-            raise ValueError(f"rasterize_gaussians: {name} must be {shape}; got {list(value.shape)}")
+    check_real(OP, near_plane=near_plane)
+    check_scene(OP, rows | optional, cameras)
     active, size = optional.get("active"), (len(cameras.viewmats), cameras.height, cameras.width)
     if active is not None and (active.shape != size or active.dtype != torch.bool):
         raise ValueError(f"{OP}: active must be bool [I, H, W] = {list(size)}; got {active.dtype} {list(active.shape)}")
+
+
+def check_scene(op: str, tensors: dict[str, Tensor], cameras: Cameras) -> None:
+    """Types of ``tensors`` and ``cameras``, and numbers of dimensions that are read before a kernel checks them."""
+    if not isinstance(cameras, Cameras):
+        raise TypeError(f"{op}: cameras must be gsim3d.Cameras; got {type(cameras).__name__}")
+    of_cameras = {f"cameras.{name}": getattr(cameras, name) for name in ("viewmats", "Ks", "image_cloud")}
+    check_tensors(op, **tensors, **of_cameras)
+    check_floating(op, means=tensors["means"])
+    check_whole(op, **{f"cameras.{name}": getattr(cameras, name) for name in ("width", "height")})
+    shapes = {"means": "[N, 3]", "cameras.viewmats": "[I, 4, 4]", "cameras.Ks": "[I, 3, 3]", "cu_rows": "[Q + 1]"}
+    for name, shape in shapes.items():
+        value = (tensors | of_cameras).get(name)
+        if value is not None and value.dim() != shape.count(",") + 1:
+            raise ValueError(f"{op}: {name} must be {shape}; got {list(value.shape)}")
 
 
 def _check_choices(
@@ -254,13 +245,13 @@ def _check_choices(
     """Returns the name and the tensor of colours."""
     check_on_invalid(on_invalid)
     if (sh is None) == (colors is None):
-        raise ValueError("rasterize_gaussians: give one of sh and colors")
+        raise ValueError(f"{OP}: give one of sh and colors")
     for name, value, known in (("cutoff", cutoff, CUTOFFS), ("jacobian", jacobian, JACOBIANS)):
         if not isinstance(value, str) or value not in known:
-            raise ValueError(f"rasterize_gaussians: {name} must be one of {', '.join(known)}; got {value!r}")
+            raise ValueError(f"{OP}: {name} must be one of {', '.join(known)}; got {value!r}")
     name, color, shape = ("sh", sh, "[N, K, 3]") if colors is None else ("colors", colors, "[N, 3]")
     if color.dim() != shape.count(",") + 1:
-        raise ValueError(f"rasterize_gaussians: {name} must be {shape}; got {list(color.shape)}")
+        raise ValueError(f"{OP}: {name} must be {shape}; got {list(color.shape)}")
     return name, color  # type: ignore[return-value]  # one of them is given
 
 
@@ -270,9 +261,9 @@ def _check_rows(rows: dict[str, Tensor]) -> None:
     wanted = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
     for name, value in rows.items():
         if not value.is_floating_point():
-            raise ValueError(f"rasterize_gaussians: {name} must be float32 or float64; got {value.dtype}")
+            raise ValueError(f"{OP}: {name} must be float32 or float64; got {value.dtype}")
         if value.shape != wanted.get(name, (n, *value.shape[1:])):
-            raise ValueError(f"rasterize_gaussians: {name} must have N={n} rows as means; got {list(value.shape)}")
+            raise ValueError(f"{OP}: {name} must have N={n} rows as means; got {list(value.shape)}")
 
 
 def _tiles(n_images, width, height):
@@ -305,28 +296,41 @@ def state_bytes(
     return sum((n + 63) // 64 * 64 for n in (64, view * n_images, 16 * n_clouds, 4 * n_images, *lists))
 
 
-@fake("rasterize_gaussians")
-def _(means, quats, scales, opacities, color, features, background, viewmats, *rest):
+def empty_images(means: Tensor, n_images: int, width: int, height: int, n_features: int, n_bytes: int) -> list[Tensor]:
+    """Color, alpha, depth, features, transmittance, last row of each pixel and the state: results of a rasterizer."""
+    shape = (n_images, height, width)
+    floats = [means.new_empty(*shape, *more) for more in ((3,), (), (), (n_features,), ())]
+    return [*floats, means.new_empty(shape, dtype=torch.int32), means.new_empty(n_bytes, dtype=torch.uint8)]
+
+
+def gradients_of_images(grads: Sequence[Tensor | None], transmittance: Tensor, n_features: int) -> list[Tensor]:
+    """Gradients of color, alpha, depth and features; zeros where there is none."""
+    sizes = ((3,), (), (), (n_features,))
+    return [
+        transmittance.new_zeros(*transmittance.shape, *size) if grad is None else grad
+        for grad, size in zip(grads, sizes, strict=False)
+    ]
+
+
+def _images(means, quats, scales, opacities, color, features, background, viewmats, *rest):
     _, _, cu_rows, width, height, _, _, _, *sizes, watch = rest[:12]  # others do not count
     n_images = viewmats.shape[0]
-    shape = (n_images, height, width)
     state = state_bytes(means, n_images, cu_rows.shape[0] - 1, width, height, sizes[0], sizes[2])
-    return (
-        means.new_empty(*shape, 3),
-        means.new_empty(shape),
-        means.new_empty(shape),
-        means.new_empty(*shape, features.shape[1]),
-        means.new_empty(shape),
-        means.new_empty(shape, dtype=torch.int32),
-        means.new_empty(state, dtype=torch.uint8),
-        means.new_empty(n_images if watch else 0, 2, dtype=torch.int64),
-    )
+    unusable = means.new_empty(n_images if watch else 0, 2, dtype=torch.int64)
+    return *empty_images(means, n_images, width, height, features.shape[1], state), unusable
 
 
-@fake("rasterize_gaussians_backward")
-def _(grad_color, grad_alpha, grad_depth, grad_features, transmittance, last, state, *inputs):
+def _gradients(grad_color, grad_alpha, grad_depth, grad_features, transmittance, last, state, *inputs):
     shapes = [x.shape for x in inputs[:7]] + [(inputs[7].shape[0] if inputs[19] else 0, 4, 4)]
     return tuple(inputs[0].new_empty(shape) for shape in shapes)
+
+
+def _tangents(*inputs):
+    return tuple(x.new_empty(x.shape) for x in (*inputs[19:23], *inputs[:8]))
+
+
+TANGENT = "rasterize_gaussians_backward_tangent"  # of images and of gradients, along a direction
+fakes(**{OP: _images, f"{OP}_backward": _gradients, TANGENT: _tangents})
 
 
 def _setup(ctx, inputs, output):
@@ -338,22 +342,15 @@ def _setup(ctx, inputs, output):
 
 def _backward(ctx, *grads):
     saved = ctx.saved_tensors  # read once: a checkpoint gives them once
-    transmittance, features = saved[0], saved[8]
-    sizes = ((3,), (), (), features.shape[1:])  # of color, alpha, depth, features
-    images = [
-        transmittance.new_zeros(*transmittance.shape, *size) if grad is None else grad
-        for grad, size in zip(grads, sizes, strict=False)
-    ]
+    images = gradients_of_images(grads, saved[0], saved[8].shape[1])
     viewmats_grad = ctx.needs_input_grad[7]
-    *grads, viewmats = call(
-        "rasterize_gaussians_backward", *images, *saved[:14], *ctx.options, viewmats_grad, *saved[14:]
-    )
+    *grads, viewmats = call(f"{OP}_backward", *images, *saved[:14], *ctx.options, viewmats_grad, *saved[14:])
     return (*grads, viewmats if viewmats_grad else None, *[None] * 13)
 
 
 def _folded(size: int, scene: Sequence[Tensor], is_batched: Sequence[bool], options: Sequence) -> tuple[list, list]:
     """Scenes of a batch one after the other in a single call: its 11 tensors, and options with its sizes."""
-    rows = [x if has else x.expand(size, *x.shape) for x, has in zip(scene, is_batched, strict=True)]
+    rows = expanded(size, scene, is_batched)
     means, viewmats, (image_cloud, cu_rows) = rows[0], rows[7], rows[9:]
     n_clouds, entry = cu_rows.shape[1] - 1, torch.arange(size, device=means.device)[:, None]
     ends = (cu_rows[:, 1:] + means.shape[1] * entry).flatten()
@@ -365,10 +362,7 @@ def _folded(size: int, scene: Sequence[Tensor], is_batched: Sequence[bool], opti
 
 def _folded_masks(size: int, active: Sequence[Tensor | None], is_batched: Sequence[bool]) -> list[Tensor | None]:
     """The last argument, if it is given, for the images of all scenes."""
-    return [
-        x if x is None else (x if has else x.expand(size, *x.shape)).flatten(0, 1)
-        for x, has in zip(active, is_batched, strict=True)
-    ]
+    return [x if x is None else x.flatten(0, 1) for x in expanded(size, active, is_batched)]
 
 
 def _batched(size, inputs, is_batched):
@@ -381,23 +375,12 @@ def _batched(size, inputs, is_batched):
 
 def _backward_batched(size, inputs, is_batched):
     if not is_batched[6]:  # the state is of one scene, which all entries share: only gradients of its images differ
-        each = [[x[k] if has else x for x, has in zip(inputs, is_batched, strict=True)] for k in range(size)]
-        return tuple(map(torch.stack, zip(*(call("rasterize_gaussians_backward", *one) for one in each), strict=True)))
-    of_images = [
-        (x if has else x.expand(size, *x.shape)).flatten(0, 1) for x, has in zip(inputs[:6], is_batched, strict=False)
-    ]
+        return one_by_one(f"{OP}_backward")(size, inputs, is_batched)
+    of_images = [x.flatten(0, 1) for x in expanded(size, inputs[:6], is_batched[:6])]
     rows, options = _folded(size, inputs[7:18], is_batched[7:18], inputs[18:])
     active = _folded_masks(size, inputs[27:], is_batched[27:])
-    grads = call("rasterize_gaussians_backward", *of_images, inputs[6][0], *rows, *options, inputs[26], *active)
+    grads = call(f"{OP}_backward", *of_images, inputs[6][0], *rows, *options, inputs[26], *active)
     return tuple(x.reshape(size, x.shape[0] // size, *x.shape[1:]) for x in grads)
-
-
-TANGENT = "rasterize_gaussians_backward_tangent"  # of images and of gradients, along a direction
-
-
-@fake(TANGENT)
-def _(*inputs):
-    return (*(x.new_empty(x.shape) for x in inputs[19:23]), *(x.new_empty(x.shape) for x in inputs[:8]))
 
 
 def _tangent(scene, tangents, images, options, active):
@@ -430,7 +413,7 @@ def _second_backward(ctx, *grads):
 
 def _second_jvp(inputs, tangents, outputs):
     images = [torch.zeros_like(x) if t is None else t for t, x in zip(tangents[:4], inputs[:4])]
-    linear = call("rasterize_gaussians_backward", *images, *inputs[4:])
+    linear = call(f"{OP}_backward", *images, *inputs[4:])
     others = _tangent(inputs[7:18], tangents[7:15], inputs[:4], inputs[18:23], inputs[27:])[4:]
     return tuple(a + b if a.shape == b.shape else a for a, b in zip(linear, others, strict=True))
 
@@ -440,9 +423,7 @@ def _third(ctx, *_):
     raise GradientError(f"{OP}: the rasterizer {said}", op=OP, argument=None, order=3)
 
 
-register_gradients("rasterize_gaussians", _backward, _setup, without=["Ks"], jvp=_jvp, batched=_batched)
-register_gradients(
-    "rasterize_gaussians_backward", _second_backward, _second_setup, jvp=_second_jvp, batched=_backward_batched
-)
+register_gradients(OP, _backward, _setup, without=["Ks"], jvp=_jvp, batched=_batched)
+register_gradients(f"{OP}_backward", _second_backward, _second_setup, jvp=_second_jvp, batched=_backward_batched)
 register_gradients(TANGENT, _third, lambda ctx, inputs, output: None, batched=one_by_one(TANGENT))
-register_autocast("rasterize_gaussians", "float32")
+register_autocast(OP, "float32")

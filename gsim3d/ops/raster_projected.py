@@ -7,8 +7,16 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsim3d.ops._arguments import check_floating, check_numbers, check_tensors, check_whole, within_memory
-from gsim3d.ops._register import fake, register_autocast, register_gradients
-from gsim3d.ops.raster import CUTOFFS, LARGEST, Rendering, sizes_of_state, state_bytes
+from gsim3d.ops._register import fakes, register_autocast, register_gradients
+from gsim3d.ops.raster import (
+    CUTOFFS,
+    LARGEST,
+    Rendering,
+    empty_images,
+    gradients_of_images,
+    sizes_of_state,
+    state_bytes,
+)
 
 OP = "rasterize_projected"
 
@@ -112,29 +120,21 @@ def _check(rows: dict[str, Tensor], optional: dict[str, Tensor], width: int, hei
     check_numbers(OP, largest_of=LARGEST, **rows)
 
 
-@fake("rasterize_projected")
-def _(means2d, conics, depths, opacities, color, features, background, absolute, image_cloud, cu_rows, *rest):
+def _images(means2d, conics, depths, opacities, color, features, background, absolute, image_cloud, cu_rows, *rest):
     width, height, _, *sizes = rest
     n_images = background.shape[0]
-    shape = (n_images, height, width)
     state = state_bytes(means2d, n_images, n_images, width, height, sizes[0], sizes[2])
-    return (
-        means2d.new_empty(*shape, 3),
-        means2d.new_empty(shape),
-        means2d.new_empty(shape),
-        means2d.new_empty(*shape, features.shape[1]),
-        means2d.new_empty(shape),
-        means2d.new_empty(shape, dtype=torch.int32),
-        means2d.new_empty(state, dtype=torch.uint8),
-    )
+    return tuple(empty_images(means2d, n_images, width, height, features.shape[1], state))
 
 
-@fake("rasterize_projected_backward")
-def _(grad_color, grad_alpha, grad_depth, grad_features, transmittance, last, state, *inputs):
+def _gradients(grad_color, grad_alpha, grad_depth, grad_features, transmittance, last, state, *inputs):
     *inputs, absolute = inputs
     shapes = [x.shape for x in inputs[:7]]
     shapes[5] = (shapes[5][0], shapes[5][1] + (2 if absolute else 0))
     return tuple(inputs[0].new_empty(shape) for shape in shapes)
+
+
+fakes(rasterize_projected=_images, rasterize_projected_backward=_gradients)
 
 
 def _setup(ctx, inputs, output):
@@ -145,17 +145,11 @@ def _setup(ctx, inputs, output):
 
 
 def _backward(ctx, *grads):
-    saved = ctx.saved_tensors
-    transmittance, n_features = saved[0], saved[8].shape[1]
-    sizes = ((3,), (), (), (n_features,))
-    images = [
-        transmittance.new_zeros(*transmittance.shape, *size) if grad is None else grad
-        for grad, size in zip(grads, sizes, strict=False)
-    ]
-    with_absolute = ctx.needs_input_grad[7]
-    *rows, features, background = torch.ops.gsim3d.rasterize_projected_backward(
-        *images, *saved, *ctx.options, with_absolute
-    )
+    saved, with_absolute = ctx.saved_tensors, ctx.needs_input_grad[7]
+    n_features = saved[8].shape[1]
+    images = gradients_of_images(grads, saved[0], n_features)
+    found = torch.ops.gsim3d.rasterize_projected_backward(*images, *saved, *ctx.options, with_absolute)
+    *rows, features, background = found
     absolute = features[:, n_features:] if with_absolute else None
     return (*rows, features[:, :n_features], background, absolute, *[None] * 8)
 

@@ -4,17 +4,11 @@ import torch
 from torch import Tensor
 
 from gsim3d.ops._arguments import check_floating, check_numbers, check_real, check_tensors
-from gsim3d.ops._register import fake, is_narrow, register_autocast, register_gradients
+from gsim3d.ops._register import fakes, is_narrow, register_autocast, register_gradients, save_inputs
 
 
 def row_norm(
-    x: Tensor,
-    weight: Tensor,
-    bias: Tensor,
-    residual: Tensor | None = None,
-    *,
-    eps: float = 1e-5,
-    check: bool = True,
+    x: Tensor, weight: Tensor, bias: Tensor, residual: Tensor | None = None, *, eps: float = 1e-5, check: bool = True
 ) -> Tensor:
     """Normalises every row over its channels, scales, shifts and adds ``residual``.
 
@@ -44,10 +38,7 @@ def row_norm(
     """
     if check:
         tensors = {"x": x, "weight": weight, "bias": bias} | ({} if residual is None else {"residual": residual})
-        check_tensors("row_norm", **tensors)
-        check_floating("row_norm", x=x)
-        check_real("row_norm", eps=eps)
-        check_numbers("row_norm", **tensors)
+        _check("row_norm", tensors, eps)
     dtype = x.dtype if residual is None else residual.dtype
     return torch.ops.gsim3d.row_norm(x, weight, bias, residual, eps, dtype)[0]
 
@@ -94,26 +85,16 @@ def residual_norm(
             if pair is not None and (not isinstance(pair, (tuple, list)) or len(pair) != 2):
                 raise TypeError(f"residual_norm: {name} must be a pair (weight, bias); got {type(pair).__name__}")
             tensors |= {} if pair is None else {f"{name}[0]": pair[0], f"{name}[1]": pair[1]}
-        check_tensors("residual_norm", **tensors)
-        check_floating("residual_norm", x=x)
-        check_real("residual_norm", eps=eps)
-        check_numbers("residual_norm", **tensors)
+        _check("residual_norm", tensors, eps)
     weights = *(branch_norm or (None, None)), *(norm or (None, None))
     return torch.ops.gsim3d.residual_norm(x, branch, keep, *weights, eps)[:2]
 
 
-@fake("row_norm")
-def _(x, weight, bias, residual, eps, dtype):
-    return x.new_empty(x.shape, dtype=dtype), weight.new_empty(x.shape[0], 2)
-
-
-@fake("row_norm_backward")
-def _(grad, x, weight, stats):
-    return (
-        torch.empty_like(x, memory_format=torch.contiguous_format),
-        torch.empty_like(weight),
-        torch.empty_like(weight),
-    )
+def _check(op: str, tensors: dict[str, Tensor], eps: float) -> None:
+    check_tensors(op, **tensors)
+    check_floating(op, x=tensors["x"])
+    check_real(op, eps=eps)
+    check_numbers(op, **tensors)
 
 
 def _setup(ctx, inputs, output):
@@ -131,21 +112,18 @@ def _backward(ctx, grad, _grad_stats):
 register_gradients("row_norm", _backward, _setup, gradient_ops=["row_norm_backward"])
 
 
-@fake("residual_norm")
-def _(x, branch, keep, branch_weight, branch_bias, weight, bias, eps):
+def _residual(x, branch, keep, branch_weight, branch_bias, weight, bias, eps):
     stats = [x.new_empty(x.shape[0] if w is not None else 0, 2) for w in (branch_weight, weight)]
     return x.new_empty(x.shape), branch.new_empty(x.shape), *stats
 
 
-@fake("residual_norm_backward")
-def _(grad_sum, grad_out, branch, sum, keep, branch_weight, weight, branch_stats, stats):
+def _residual_gradients(grad_sum, grad_out, branch, sum, keep, branch_weight, weight, branch_stats, stats):
     channels = sum.shape[1]
     of_norms = [sum.new_empty(channels if w is not None else 0) for w in (branch_weight, branch_weight, weight, weight)]
     return sum.new_empty(sum.shape), branch.new_empty(sum.shape), sum.new_empty(channels), *of_norms
 
 
-@fake("linear_grad_bias")
-def _(grad):
+def _bias_gradient(grad):
     return grad.new_empty(grad.shape[1], dtype=torch.promote_types(grad.dtype, torch.float32))
 
 
@@ -209,18 +187,23 @@ def norm_gelu(x: Tensor, mean: Tensor, scale: Tensor, bias: Tensor, *, check: bo
     return torch.ops.gsim3d.norm_gelu(x, mean, scale, bias, scale.dtype)
 
 
-@fake("norm_gelu")
-def _(x, mean, scale, bias, dtype):
-    return x.new_empty(x.shape, dtype=dtype)
+def _norm(x, weight, bias, residual, eps, dtype):
+    return x.new_empty(x.shape, dtype=dtype), weight.new_empty(x.shape[0], 2)
 
 
-@fake("norm_gelu_backward")
-def _(grad, x, mean, scale, bias):
-    return x.new_empty(x.shape), scale.new_empty(scale.shape), scale.new_empty(scale.shape)
+def _norm_gradients(grad, x, weight, *_):
+    return x.new_empty(x.shape), weight.new_empty(weight.shape), weight.new_empty(weight.shape)
 
 
-def _gelu_setup(ctx, inputs, output):
-    ctx.save_for_backward(*inputs[:4])
+fakes(
+    row_norm=_norm,
+    row_norm_backward=_norm_gradients,
+    residual_norm=_residual,
+    residual_norm_backward=_residual_gradients,
+    linear_grad_bias=_bias_gradient,
+    norm_gelu=lambda x, mean, scale, bias, dtype: x.new_empty(x.shape, dtype=dtype),
+    norm_gelu_backward=_norm_gradients,
+)
 
 
 def _gelu_backward(ctx, grad):
@@ -229,7 +212,7 @@ def _gelu_backward(ctx, grad):
     return x, -saved[2] * bias, scale, bias, None
 
 
-register_gradients("norm_gelu", _gelu_backward, _gelu_setup, gradient_ops=["norm_gelu_backward"])
+register_gradients("norm_gelu", _gelu_backward, save_inputs, gradient_ops=["norm_gelu_backward"])
 
 
 def _gelu_autocast(device, arguments):

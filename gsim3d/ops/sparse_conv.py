@@ -5,7 +5,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from gsim3d.ops._arguments import as_given, check_numbers, check_tensors, check_whole, widened, widened_on_cpu
-from gsim3d.ops._register import call, fake, one_by_one, register_autocast, register_gradients
+from gsim3d.ops._register import call, fakes, one_by_one, register_autocast, register_gradients
 from gsim3d.ops.curve import KernelMap, Voxels
 
 
@@ -31,8 +31,7 @@ def sparse_conv(
         weight: [C_out, Kx, Ky, Kz, C_in]; axes 1 to 3 walk x, y, z.
         bias: [C_out] or None.
         voxels: which rows share a voxel (``Stage.voxels`` of :func:`gsim3d.ops.build_pyramid`, or of
-            :meth:`KernelMap.from_indices`). Where there are more
-            voxels than rows, the last ones are empty.
+            :meth:`KernelMap.from_indices`). Where there are more voxels than rows, the last ones are empty.
         kernel_map: pairs of neighbouring voxels for K (``Stage.kernel_maps[K]``); those behind the last offset take no
             part.
         duplicates: "mean", or "first" for the lowest row, which depends on the order of the rows.
@@ -60,15 +59,16 @@ def sparse_conv(
         tensor([[1.],
                 [2.]])
     """
+    op = "sparse_conv"
     if duplicates not in ("mean", "first"):
         raise ValueError(f'sparse_conv: duplicates must be "mean" or "first"; got {duplicates!r}')
     if check:
         floats = {"x": x, "weight": weight} | ({} if bias is None else {"bias": bias})
         lists = {name: getattr(voxels, name) for name in ("row_voxel", "rows", "cu_rows")}
         taps = {name: getattr(kernel_map, name) for name in ("tap_in", "tap_out", "cu_taps")}
-        check_tensors("sparse_conv", **floats, **lists, **taps)
-        check_whole("sparse_conv", kernel_size=kernel_map.kernel_size)
-        check_numbers("sparse_conv", **floats)
+        check_tensors(op, **floats, **lists, **taps)
+        check_whole(op, kernel_size=kernel_map.kernel_size)
+        check_numbers(op, **floats)
     if weight.dim() == 5:
         own, wanted = weight.shape[1], kernel_map.kernel_size
         if kernel_map.shape is not None:
@@ -120,44 +120,26 @@ def _around_the_centre(weight: Tensor, cube: int) -> Tensor:
 
 
 def _convolved(x, weight, bias, voxels: Voxels, kernel_map: KernelMap, first: bool) -> Tensor:
-    return call(
-        "sparse_conv",
-        x,
-        weight,
-        bias,
-        voxels.row_voxel,
-        voxels.rows,
-        voxels.cu_rows,
-        kernel_map.tap_in,
-        kernel_map.tap_out,
-        kernel_map.cu_taps,
-        first,
-        kernel_map.plan,
-    )
+    geometry = voxels.row_voxel, voxels.rows, voxels.cu_rows, kernel_map.tap_in, kernel_map.tap_out, kernel_map.cu_taps
+    return call("sparse_conv", x, weight, bias, *geometry, first, kernel_map.plan)
 
 
-@fake("sparse_conv_plan")
-def _(row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps, kernel_size):
+def _plan(row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps, kernel_size):
     taps, groups = kernel_size**3, (row_voxel.shape[0] + 255) // 256 * 4
     return row_voxel.new_empty(groups * (64 * (taps + 1) + (taps + 31) // 32), dtype=torch.int32)
 
 
-@fake("sparse_conv")
-def _(x, weight, bias, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps, first, plan=None):
-    return x.new_empty(x.shape[0], weight.shape[0])
-
-
-@fake("sparse_conv_grad_input")
-def _(grad, weight, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps, first, plan=None):
-    return grad.new_empty(grad.shape[0], weight.shape[4])
-
-
-@fake("sparse_conv_grad_weight")
-def _(grad, x, kernel_size, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps, first, rounded=False):
-    c_out, k, dtype = grad.shape[1], kernel_size, grad.dtype
-    if not rounded:
-        dtype = torch.promote_types(dtype, torch.float32)
+def _weight_gradients(grad, x, k, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps, first, rounded=False):
+    c_out, dtype = grad.shape[1], grad.dtype if rounded else torch.promote_types(grad.dtype, torch.float32)
     return grad.new_empty(c_out, k, k, k, x.shape[1], dtype=dtype), grad.new_empty(c_out, dtype=dtype)
+
+
+fakes(
+    sparse_conv=lambda x, weight, *_: x.new_empty(x.shape[0], weight.shape[0]),
+    sparse_conv_grad_input=lambda grad, weight, *_: grad.new_empty(grad.shape[0], weight.shape[4]),
+    sparse_conv_grad_weight=_weight_gradients,
+    sparse_conv_plan=_plan,
+)
 
 
 def _setup(ctx, inputs, output):
@@ -238,11 +220,8 @@ def _batched(op: str, n_floats: int):
 
 def _beside(size, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps):
     """The geometry of ``size`` copies; pairs stay sorted by tap."""
-    n, n_voxels, entry = (
-        row_voxel.shape[0],
-        cu_voxel_rows.shape[0] - 1,
-        torch.arange(size, device=tap_in.device)[:, None],
-    )
+    n, n_voxels = row_voxel.shape[0], cu_voxel_rows.shape[0] - 1
+    entry = torch.arange(size, device=tap_in.device)[:, None]
     tap = torch.searchsorted(cu_taps[1:], torch.arange(tap_in.shape[0], device=tap_in.device), right=True)
     order = torch.argsort(tap.expand(size, -1).flatten(), stable=True)
     return (
@@ -255,14 +234,8 @@ def _beside(size, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps
     )
 
 
+_of_input, _of_weight = "sparse_conv_grad_input", "sparse_conv_grad_weight"
 register_gradients("sparse_conv", _backward, _setup, jvp=_jvp, batched=_batched("sparse_conv", 3))
-register_gradients(
-    "sparse_conv_grad_input",
-    _grad_input_backward,
-    _grad_input_setup,
-    batched=_batched("sparse_conv_grad_input", 2),
-)
-register_gradients(
-    "sparse_conv_grad_weight", _grad_weight_backward, _grad_weight_setup, batched=one_by_one("sparse_conv_grad_weight")
-)
+register_gradients(_of_input, _grad_input_backward, _grad_input_setup, batched=_batched(_of_input, 2))
+register_gradients(_of_weight, _grad_weight_backward, _grad_weight_setup, batched=one_by_one(_of_weight))
 register_autocast("sparse_conv", "follow")

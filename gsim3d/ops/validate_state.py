@@ -11,7 +11,7 @@ from torch import Tensor
 from gsim3d._core import constants
 from gsim3d.numerics.policy import LARGEST
 from gsim3d.ops._arguments import check_real, check_tensors, check_whole
-from gsim3d.ops._register import fake, refuse
+from gsim3d.ops._register import fakes, refuse
 
 CELLS: int = constants["validate_cells"]  # of a workspace along each axis
 OUTSIDE: int = constants["validate_outside"]  # bits of a status
@@ -26,11 +26,8 @@ class PartialRecord(NamedTuple):
 
     Attributes:
         parts: what each part of the rows counted.
-        cu_rows: of the call.
-        n_rows: of the call.
-        shape: of the record.
-        dtype: of the record.
-        device: of the record.
+        cu_rows, n_rows: of the call.
+        shape, dtype, device: of the record.
     """
 
     parts: Tensor
@@ -120,19 +117,10 @@ def validate_state(
         check_real("validate_state", grid_size=grid_size, max_step=max_step)
     if neutral is not None:
         refuse("validate_state", {f"fields[{f}]": field for f, field in enumerate(fields)})
+    low, high = ([pair[end] for pair in bounds] for end in (0, 1))
     status, record, sanitized = torch.ops.gsim3d.validate_state(
-        _detached(fields),
-        [low for low, _ in bounds],
-        [high for _, high in bounds],
-        cu_rows,
-        cloud_scene,
-        origin,
-        activity,
-        _detached(previous or ()),
-        grid_size,
-        max_step,
-        [] if neutral is None else list(neutral),
-        join,
+        *(_detached(fields), low, high, cu_rows, cloud_scene, origin, activity, _detached(previous or ())),
+        *(grid_size, max_step, [] if neutral is None else list(neutral), join),
     )
     if not join:
         shape = torch.Size((cu_rows.shape[0] - 1, record.shape[1]))
@@ -170,9 +158,8 @@ def _check_arguments(
         if not isinstance(value, (tuple, list)):
             raise TypeError(f"validate_state: {name} must be a tuple or a list; got {type(value).__name__}")
         if len(value) != len(fields):
-            raise ValueError(
-                f"validate_state: {name} must have one entry for each of {len(fields)} fields; got {len(value)}"
-            )
+            wanted = f"one entry for each of {len(fields)} fields"
+            raise ValueError(f"validate_state: {name} must have {wanted}; got {len(value)}")
     tensors = {f"fields[{f}]": field for f, field in enumerate(fields)}
     tensors |= {f"previous[{f}]": field for f, field in enumerate(previous or ())}
     check_tensors("validate_state", **tensors, **clouds)
@@ -183,11 +170,12 @@ def _check_arguments(
         check_real("validate_state", **{f"bounds[{f}][{end}]": value for end, value in enumerate(pair)})
 
 
-@fake("validate_state")
-def _(fields, low, high, cu_rows, cloud_scene, origin, activity, previous, grid_size, max_step, neutral, joined=True):
+def _validated(
+    fields, low, high, cu_rows, cloud_scene, origin, activity, previous, grid_size, max_step, neutral, *join
+):
     columns = 2 * (len(fields) + 2) + len(SUMS)
     n_rows, n_records = fields[0].shape[0], cu_rows.shape[0] - 1
-    if not joined:
+    if not all(join):
         n_records = max(0, n_records - 1 + -(-n_rows // _ROWS_A_PART[fields[0].device.type]))
     return (
         fields[0].new_empty(n_rows, dtype=torch.int32),
@@ -196,7 +184,9 @@ def _(fields, low, high, cu_rows, cloud_scene, origin, activity, previous, grid_
     )
 
 
-@fake("join_records")
-def _(parts, cu_rows, n_rows):
+def _joined(parts, cu_rows, n_rows):
     total = sum((offsets.shape[0] - 1) * own.shape[1] for own, offsets in zip(parts, cu_rows, strict=True))
     return parts[0].new_empty(total)
+
+
+fakes(validate_state=_validated, join_records=_joined)
