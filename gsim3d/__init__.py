@@ -15,57 +15,23 @@ __version__ = "0.2.0"
 check_processor()
 
 _HOME = {
-    "gsim3d.cameras": ("Cameras", "FrameSource", "Frames", "InputSpec"),
-    "gsim3d.effects.spec": ("EffectsSpec", "UnsupportedEffect"),
-    "gsim3d.errors": ("GradientError", "InputError", "NumericalError", "ProcessorError"),
-    "gsim3d.numerics.report": ("StabilityReport",),
-    "gsim3d.presets": ("ModelConfig",),
-    "gsim3d.profile.autotune": ("autotune",),
-    "gsim3d.simulator": ("Prediction", "Simulator"),
-    "gsim3d.state": ("Actions", "Gaussians", "Particles"),
-    "gsim3d.ops": (
-        "CURVES",
-        "KernelMap",
-        "PatchTable",
-        "Projection",
-        "Pyramid",
-        "PyramidCapacity",
-        "PyramidSpec",
-        "Rendering",
-        "Segments",
-        "Stage",
-        "Voxels",
-        "add_cells",
-        "build_pyramid",
-        "cuda_compiled",
-        "curve_encode",
-        "curve_sort",
-        "decode_gaussians",
-        "find_cells",
-        "joint_attention",
-        "norm_gelu",
-        "overlapping_patches",
-        "patch_attention",
-        "plane_sweep",
-        "pool_max",
-        "pool_mean",
-        "project_gaussians",
-        "rasterize_gaussians",
-        "rasterize_projected",
-        "residual_norm",
-        "row_norm",
-        "row_scenes",
-        "sh_to_color",
-        "segment_min",
-        "segment_softmax",
-        "segment_sum",
-        "sparse_conv",
-        "sweep_geometry",
-        "unpool",
-        "validate_state",
-    ),
+    "gsim3d.cameras": "Cameras FrameSource Frames InputSpec",
+    "gsim3d.effects.spec": "EffectsSpec UnsupportedEffect",
+    "gsim3d.errors": "GradientError InputError NumericalError ProcessorError",
+    "gsim3d.numerics.report": "StabilityReport",
+    "gsim3d.presets": "ModelConfig",
+    "gsim3d.profile.autotune": "autotune",
+    "gsim3d.simulator": "Prediction Simulator",
+    "gsim3d.state": "Actions Gaussians Particles",
+    "gsim3d.ops": """
+        CURVES KernelMap PartialRecord PatchTable Projection Pyramid PyramidCapacity PyramidSpec Rendering Segments
+        Stage ValidatedState Voxels add_cells build_pyramid cuda_compiled curve_encode curve_sort decode_gaussians
+        find_cells join_records joint_attention norm_gelu overlapping_patches patch_attention plane_sweep pool_max
+        pool_mean project_gaussians rasterize_gaussians rasterize_projected residual_norm row_norm row_scenes
+        sh_to_color segment_min segment_softmax segment_sum sparse_conv sweep_geometry unpool validate_state
+    """,
 }
-_MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
+_MODULE_OF = {name: module for module, names in _HOME.items() for name in names.split()}
 
 __all__ = ["__version__", *_MODULE_OF]
 
@@ -79,47 +45,7 @@ if TYPE_CHECKING:  # the same names for type checkers; tests/test_types.py compa
         ProcessorError as ProcessorError,
     )
     from gsim3d.numerics.report import StabilityReport as StabilityReport
-    from gsim3d.ops import (
-        CURVES as CURVES,
-        KernelMap as KernelMap,
-        PatchTable as PatchTable,
-        Projection as Projection,
-        Pyramid as Pyramid,
-        PyramidCapacity as PyramidCapacity,
-        PyramidSpec as PyramidSpec,
-        Rendering as Rendering,
-        Segments as Segments,
-        Stage as Stage,
-        Voxels as Voxels,
-        add_cells as add_cells,
-        build_pyramid as build_pyramid,
-        cuda_compiled as cuda_compiled,
-        curve_encode as curve_encode,
-        curve_sort as curve_sort,
-        decode_gaussians as decode_gaussians,
-        find_cells as find_cells,
-        joint_attention as joint_attention,
-        norm_gelu as norm_gelu,
-        overlapping_patches as overlapping_patches,
-        patch_attention as patch_attention,
-        plane_sweep as plane_sweep,
-        pool_max as pool_max,
-        pool_mean as pool_mean,
-        project_gaussians as project_gaussians,
-        rasterize_gaussians as rasterize_gaussians,
-        rasterize_projected as rasterize_projected,
-        residual_norm as residual_norm,
-        row_norm as row_norm,
-        row_scenes as row_scenes,
-        segment_min as segment_min,
-        segment_softmax as segment_softmax,
-        segment_sum as segment_sum,
-        sh_to_color as sh_to_color,
-        sparse_conv as sparse_conv,
-        sweep_geometry as sweep_geometry,
-        unpool as unpool,
-        validate_state as validate_state,
-    )
+    from gsim3d.ops import *  # noqa: F403
     from gsim3d.presets import ModelConfig as ModelConfig
     from gsim3d.profile.autotune import autotune as autotune
     from gsim3d.simulator import Prediction as Prediction, Simulator as Simulator

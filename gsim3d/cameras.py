@@ -65,15 +65,8 @@ class Cameras(TensorRecord):
             images: int64, indices of the cameras.
             image_cloud: int64, clouds that they show. Default: unchanged.
         """
-        return Cameras(
-            self.viewmats[images],
-            self.Ks[images],
-            self.near[images],
-            self.far[images],
-            self.image_cloud[images] if image_cloud is None else image_cloud,
-            self.width,
-            self.height,
-        )
+        chosen = self.map(lambda values: values[images])
+        return chosen if image_cloud is None else dataclasses.replace(chosen, image_cloud=image_cloud)
 
 
 @dataclass(frozen=True)

@@ -276,7 +276,10 @@ class CapturedRollout:
             if frozen is None:
                 steps = self._model.rollout(self._state, self._n_steps, plan, **options)
             else:
-                moving = self._advance(frozen.context, plan, **options)
+                guard = self._model._guard("rollout", None, report)
+                options = {"generator": None, "guard": guard, "geometry": geometry, "background": frozen.context}
+                predict = functools.partial(self._model._predict, plan=plan, **options)
+                moving = rollout(predict, self._state, self._n_steps, plan.history)
                 steps = [frozen.partition.whole(step, 1 + i) for i, step in enumerate(moving)]
             if self._cameras is not None:
                 drawn = {"plan": self._drawn, "cutoff": self._cutoff, "report": report}
@@ -296,13 +299,6 @@ class CapturedRollout:
         """Validates a state and splits it into movable and frozen particles."""
         validated = self._simulator._guard("rollout", None, self._report)(prepared)
         return Partition.of(validated, asymmetric=True)
-
-    def _advance(self, context: FrozenContext, plan: Plan, geometry, report: StabilityReport) -> list[Particles]:
-        """Rolls out the movable particles with the frozen context."""
-        guard = self._model._guard("rollout", None, report)
-        options = {"plan": plan, "generator": None, "guard": guard, "geometry": geometry, "background": context}
-        predict = functools.partial(self._model._predict, **options)
-        return rollout(predict, self._state, self._n_steps, plan.history)
 
     def _autocast(self) -> torch.autocast:
         return torch.autocast(self._device.type, self._dtype, enabled=self._dtype is not None, cache_enabled=False)
@@ -374,9 +370,8 @@ class CapturedRollout:
         """Copies the frozen particles into the graph's memory; returns the movable particles."""
         own = self._frozen.partition
         self._check(parts.moving, own.moving.clouds, " among movable particles")
-        background = parts.background.row_fields()
-        own_background = own.background.row_fields()
-        changed = self._is_stale or not all(torch.equal(background[name], x) for name, x in own_background.items())
+        known, given = own.background.row_fields(), parts.background.row_fields()
+        changed = self._is_stale or not all(torch.equal(given[name], x) for name, x in known.items())
         _copy(own.newest, parts.newest)
         _copy(own.background, parts.background)
         own.rows.copy_(parts.rows)
@@ -391,20 +386,17 @@ class CapturedRollout:
     def _check(self, state: Particles, own: CloudTable, where: str = "") -> None:
         table = state.clouds
         if (table.starts, table.scenes) != (own.starts, own.scenes):
-            raise InputError(
-                f"CapturedRollout: state must have the rows and scenes of the first one{where}, clouds that start at "
-                f"rows {[*own.starts]} of scenes {[*own.scenes]}; got {[*table.starts]} of {[*table.scenes]}"
-            )
+            rows, got = (f"rows {[*of.starts]} of scenes {[*of.scenes]}" for of in (own, table))
+            wanted = f"the rows and scenes of the first one{where}, clouds that start at {rows}"
+            raise InputError(f"CapturedRollout: state must have {wanted}; got {got}")
         if gaps_of(table) != gaps_of(own):
-            raise InputError(
-                f"CapturedRollout: state must have the same differences between steps as the first one, "
-                f"{list(own.steps)}; got {list(table.steps)}"
-            )
+            wanted = f"the same differences between steps as the first one, {list(own.steps)}"
+            raise InputError(f"CapturedRollout: state must have {wanted}; got {list(table.steps)}")
         for name, value in self._state.row_fields().items():
             given, shape = getattr(state, name), (table.starts[-1], *value.shape[1:])
             if given is None or given.shape != shape or given.device != value.device:
                 raise InputError(f"CapturedRollout: state.{name} must be {list(shape)} on {value.device}")
-        if _kind(state.actions) != _kind(self._state.actions):
+        if kind_of(state.actions) != kind_of(self._state.actions):
             raise InputError("CapturedRollout: state.actions must have as many points, of the same types, as the first")
 
     def _load(self, cameras: Cameras) -> None:
@@ -412,10 +404,8 @@ class CapturedRollout:
         fixed = None if own is None else (len(own), own.width, own.height)
         if fixed != (len(cameras), cameras.width, cameras.height):
             wanted = "none" if own is None else "{} of {} x {} pixels".format(*fixed)
-            raise InputError(
-                f"CapturedRollout: cameras must have the number and size of the first ones, {wanted}; "
-                f"got {len(cameras)} of {cameras.width} x {cameras.height}"
-            )
+            wanted, got = f"the number and size of the first ones, {wanted}", f"{cameras.width} x {cameras.height}"
+            raise InputError(f"CapturedRollout: cameras must have {wanted}; got {len(cameras)} of {got}")
         for name in ("viewmats", "Ks", "near", "far", "image_cloud"):
             getattr(own, name).copy_(getattr(cameras, name))
 
@@ -435,9 +425,10 @@ class CapturedRollout:
         return Prediction(steps, list(renderings))
 
 
-def observing_geometry(
-    dynamics: Dynamics, factor: float
-) -> tuple[Callable[[Particles], Pyramid], list[PyramidCapacity]]:
+Geometry = Callable[[Particles], Pyramid]  # of a history
+
+
+def observing_geometry(dynamics: Dynamics, factor: float) -> tuple[Geometry, list[PyramidCapacity]]:
     """Returns a geometry function of exact sizes, and the list of capacities, with a margin, that its calls fill."""
     needed: list[PyramidCapacity] = []
 
@@ -449,9 +440,7 @@ def observing_geometry(
     return geometry, needed
 
 
-def fixed_geometry(
-    dynamics: Dynamics, capacities: Sequence[PyramidCapacity]
-) -> tuple[Callable[[Particles], Pyramid], list[Tensor]]:
+def fixed_geometry(dynamics: Dynamics, capacities: Sequence[PyramidCapacity]) -> tuple[Geometry, list[Tensor]]:
     """Returns a geometry function of fixed capacities, and the list of sizes found, which its calls fill."""
     sizes, found = iter(capacities), []
 
@@ -489,7 +478,8 @@ def _copy(own: Particles, given: Particles) -> None:
         own.actions.types.copy_(given.actions.types)
 
 
-def _kind(actions: Actions | None) -> tuple | None:
+def kind_of(actions: Actions | None) -> tuple | None:
+    """Returns what a graph fixes of actions."""
     return None if actions is None else (actions.positions.shape, actions.names)
 
 

@@ -45,79 +45,33 @@ class ModelConfig:
 def tiny() -> ModelConfig:
     """Smallest model, trains on two CPU cores in minutes: 64-pixel images, scenes of about 1 m, history up to 2."""
     encoder = EncoderConfig.tiny()
-    return ModelConfig(
-        encoder=encoder,
-        dynamics=DynamicsConfig(
-            dynamic_latents=encoder.dynamic_dim,
-            static_latents=encoder.static_dim,
-            max_step=0.5,
-            max_latent_step=1.0,
-            position_features=True,
-            grid_size=0.05,
-            history_bits=1,
-            strides=(2, 4),
-            merge_windows=(2, 1),
-            patch_sizes=(256, 256, 256),
-            encoder_depths=(1, 1, 1),
-            encoder_channels=(24, 32, 48),
-            encoder_heads=(3, 4, 6),
-            decoder_depths=(1, 1),
-            decoder_channels=(24, 32),
-            decoder_heads=(3, 4),
-            mlp_ratio=2,
-            norm="layer",
-            zero_init=True,
-            drop_path=0.0,
-            shuffle_orders=False,
-        ),
-        renderer=RendererConfig(
-            latents=encoder.dynamic_dim + encoder.static_dim,
-            sh_degree=0,
-            scale_min=0.002,
-            scale_max=0.08,
-            initial_scale=0.02,
-        ),
-    )
+    dynamics = DynamicsConfig(
+        dynamic_latents=encoder.dynamic_dim, static_latents=encoder.static_dim, max_step=0.5, max_latent_step=1.0,
+        position_features=True, grid_size=0.05, history_bits=1, strides=(2, 4), merge_windows=(2, 1),
+        patch_sizes=(256, 256, 256), encoder_depths=(1, 1, 1), encoder_channels=(24, 32, 48), encoder_heads=(3, 4, 6),
+        decoder_depths=(1, 1), decoder_channels=(24, 32), decoder_heads=(3, 4), mlp_ratio=2, norm="layer",
+        zero_init=True, drop_path=0.0, shuffle_orders=False,
+    )  # fmt: skip
+    latents = encoder.dynamic_dim + encoder.static_dim
+    renderer = RendererConfig(latents=latents, sh_degree=0, scale_min=0.002, scale_max=0.08, initial_scale=0.02)
+    return ModelConfig(encoder, dynamics, renderer)
 
 
 def small() -> ModelConfig:
     """Model of about 4 million parameters, trains in a day on one GPU: 128-pixel images, history up to 4."""
     encoder = EncoderConfig(
-        feature_dim=64,
-        cnn_dims=(32, 48, 64),
-        transformer_layers=4,
-        transformer_mlp_ratio=2,
-        cost_unet_dim=32,
-        refine_unet_dim=32,
-        upsampled_dim=32,
-        disparity_dim=32,
-        dynamic_dim=32,
-        static_dim=32,
-    )
-    return ModelConfig(
-        encoder=encoder,
-        dynamics=DynamicsConfig(
-            dynamic_latents=encoder.dynamic_dim,
-            static_latents=encoder.static_dim,
-            max_latent_step=1.0,
-            position_features=True,
-            grid_size=0.02,
-            history_bits=2,
-            strides=(2, 2, 2),
-            merge_windows=(2, 2, 1),
-            patch_sizes=(512,) * 4,
-            encoder_depths=(2, 2, 2, 2),
-            encoder_channels=(32, 48, 64, 128),
-            encoder_heads=(2, 3, 4, 8),
-            decoder_depths=(1, 1, 1),
-            decoder_channels=(32, 48, 64),
-            decoder_heads=(2, 3, 4),
-            norm="layer",
-            zero_init=True,
-            drop_path=0.1,
-        ),
-        renderer=RendererConfig(latents=64, sh_degree=1, scale_min=0.0005, scale_max=0.1, initial_scale=0.01),
-    )
+        feature_dim=64, cnn_dims=(32, 48, 64), transformer_layers=4, transformer_mlp_ratio=2, cost_unet_dim=32,
+        refine_unet_dim=32, upsampled_dim=32, disparity_dim=32, dynamic_dim=32, static_dim=32,
+    )  # fmt: skip
+    dynamics = DynamicsConfig(
+        dynamic_latents=encoder.dynamic_dim, static_latents=encoder.static_dim, max_latent_step=1.0,
+        position_features=True, grid_size=0.02, history_bits=2, strides=(2, 2, 2), merge_windows=(2, 2, 1),
+        patch_sizes=(512,) * 4, encoder_depths=(2, 2, 2, 2), encoder_channels=(32, 48, 64, 128),
+        encoder_heads=(2, 3, 4, 8), decoder_depths=(1, 1, 1), decoder_channels=(32, 48, 64), decoder_heads=(2, 3, 4),
+        norm="layer", zero_init=True, drop_path=0.1,
+    )  # fmt: skip
+    renderer = RendererConfig(latents=64, sh_degree=1, scale_min=0.0005, scale_max=0.1, initial_scale=0.01)
+    return ModelConfig(encoder, dynamics, renderer)
 
 
 def paper_latent(n_steps: int = 4, latents: int = 32) -> ModelConfig:
@@ -127,11 +81,9 @@ def paper_latent(n_steps: int = 4, latents: int = 32) -> ModelConfig:
         n_steps: history, 1, 2, 4 or 8.
         latents: number of dynamic latents, and of static latents; 32 in the paper, 64 in the published settings.
     """
-    return ModelConfig(
-        encoder=EncoderConfig(dynamic_dim=latents, static_dim=latents),
-        dynamics=DynamicsConfig(dynamic_latents=latents, static_latents=latents, history_bits=_bits(n_steps)),
-        renderer=RendererConfig(latents=2 * latents),
-    )
+    encoder = EncoderConfig(dynamic_dim=latents, static_dim=latents)
+    dynamics = DynamicsConfig(dynamic_latents=latents, static_latents=latents, history_bits=_bits(n_steps))
+    return ModelConfig(encoder, dynamics, RendererConfig(latents=2 * latents))
 
 
 def paper_explicit(n_steps: int = 4, static_latents: int = 16) -> ModelConfig:
@@ -141,19 +93,11 @@ def paper_explicit(n_steps: int = 4, static_latents: int = 16) -> ModelConfig:
         n_steps: history, 1, 2, 4 or 8.
         static_latents: number of static latents; 16 in the paper, 0 in the published settings.
     """
-    return ModelConfig(
-        encoder=EncoderConfig(dynamic_dim=0, static_dim=static_latents, explicit=True),
-        dynamics=DynamicsConfig(
-            dynamic_latents=0,
-            static_latents=static_latents,
-            explicit=True,
-            scale_min=0.004,
-            scale_max=0.14,
-            max_step=0.05,
-            history_bits=_bits(n_steps),
-        ),
-        renderer=RendererConfig(latents=0, scale_min=0.004, scale_max=0.14),
-    )
+    scales = {"scale_min": 0.004, "scale_max": 0.14}
+    sizes = {"static_latents": static_latents, "max_step": 0.05, "history_bits": _bits(n_steps)}
+    encoder = EncoderConfig(dynamic_dim=0, static_dim=static_latents, explicit=True)
+    dynamics = DynamicsConfig(dynamic_latents=0, explicit=True, **sizes, **scales)
+    return ModelConfig(encoder, dynamics, RendererConfig(latents=0, **scales))
 
 
 def _bits(n_steps: int) -> int:

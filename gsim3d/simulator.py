@@ -210,9 +210,8 @@ class Simulator(nn.Module):
         names = (name for name, _ in self.named_parameters())
         unused = unused_parameters(plan, self.config, names)
         if needed := sorted(self.absent.difference(unused)):
-            raise UnsupportedEffect(
-                f"unsupported effects: they require {', '.join(needed)}, which the weights do not contain"
-            )
+            lacks = f"they require {', '.join(needed)}, which the weights do not contain"
+            raise UnsupportedEffect(f"unsupported effects: {lacks}")
         return dataclasses.replace(plan, unused=unused)
 
     def step(
@@ -307,10 +306,8 @@ class Simulator(nn.Module):
         plan, guard = plan or self.plan(), self._guard("rollout", on_invalid, report)
         self._check(state, "rollout")
         if graph is not None:
-            others: dict[str, Any] = dict(
-                generator=generator, on_invalid=on_invalid, geometry=geometry, wrap=wrap, log=log
-            )
-            others |= dict(edits=(edits := tuple(edits)), actors=tuple(actors))
+            others: dict[str, Any] = {"edits": (edits := tuple(edits)), "actors": tuple(actors), "log": log}
+            others |= {"generator": generator, "on_invalid": on_invalid, "geometry": geometry, "wrap": wrap}
             replayed = self.graphs.replayed(self, state, n_steps, plan, guard.keywords["report"], others)
             if replayed is not None:
                 return replayed
@@ -349,15 +346,9 @@ class Simulator(nn.Module):
         if rule is not None:
             changing = [name for name, who in self._changes(plan).items() if who != "none"]
             sleepers = Sleepers(rule, last_steps(state, 1), config.grid_size, plan.history, changing)
-        return rollout_in_parts(
-            predict,
-            state,
-            n_steps,
-            plan.history,
-            remember=partial(self.dynamics.remember, generator=generator) if config.is_asymmetric else None,
-            sleepers=sleepers,
-            log=log,
-        )
+        remember = partial(self.dynamics.remember, generator=generator) if config.is_asymmetric else None
+        options = {"remember": remember, "sleepers": sleepers, "log": log}
+        return rollout_in_parts(predict, state, n_steps, plan.history, **options)
 
     def _prepare(self, state: Particles, plan: Plan) -> Particles:
         """Prepares ``state`` for the dynamics: trims it to the history, and applies the plan's background mode and
@@ -425,26 +416,17 @@ class Simulator(nn.Module):
         background: Tensor | None = None,
         plan: Plan | None = None,
         *,
-        active: Tensor | None = None,
-        cutoff: str = "exact",
         on_invalid: OnInvalid | None = None,
         report: StabilityReport | None = None,
+        **options: Any,
     ) -> Rendering:
         """Renders like :meth:`render`, without validating ``particles``."""
-        on_invalid, report = on_invalid or self.config.stability.on_invalid, self.report if report is None else report
         outputs = plan.spec.outputs if plan else OutputEffects(depth=True, alpha=True)
+        options["on_invalid"] = on_invalid or self.config.stability.on_invalid
+        options |= {"report": self.report if report is None else report, "jacobian": self.config.renderer.jacobian}
+        options["features"] = particles.latents if outputs.features else None
         gaussians = self.renderer(particles, sh_degree=plan.sh_degree if plan else None, rgb=outputs.rgb)
-        image = self._rasterized(
-            gaussians,
-            cameras,
-            background,
-            features=particles.latents if outputs.features else None,
-            active=active,
-            cutoff=cutoff,
-            jacobian=self.config.renderer.jacobian,
-            on_invalid=on_invalid,
-            report=report,
-        )
+        image = self._rasterized(gaussians, cameras, background, **options)
         asked = (outputs.rgb, outputs.alpha, outputs.depth, outputs.features)
         return Rendering(*(made if wanted else None for made, wanted in zip(image, asked, strict=True)))
 
@@ -495,14 +477,9 @@ class Simulator(nn.Module):
             limits = dataclasses.replace(limits, on_invalid=on_invalid)
         report = self.report if report is None else report
         report.poll()
-        return partial(
-            validate_particles,
-            config=limits,
-            report=report,
-            where=where,
-            grid_size=dynamics.grid_size if in_workspace and dynamics.origin_of_scene else 0.0,
-            max_opacity=dynamics.max_opacity,
-        )
+        size = dynamics.grid_size if in_workspace and dynamics.origin_of_scene else 0.0
+        bounds = {"grid_size": size, "max_opacity": dynamics.max_opacity}
+        return partial(validate_particles, config=limits, report=report, where=where, **bounds)
 
     def _predict(
         self,

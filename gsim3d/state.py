@@ -101,6 +101,10 @@ class CloudTable:
         """Number of particles of each cloud."""
         return [self.count(cloud) for cloud in range(len(self))]
 
+    def with_counts(self, counts: Iterable[int]) -> CloudTable:
+        """The same scenes and steps with other numbers of particles."""
+        return self.make(counts, self.scenes, self.steps, self.tensors[0].device)
+
     def ahead(self, n_steps: int) -> CloudTable:
         """The same clouds ``n_steps`` later."""
         return self.make(self.counts, self.scenes, (step + n_steps for step in self.steps), self.tensors[0].device)
@@ -522,6 +526,18 @@ def concatenate(parts: Sequence[Particles], max_steps: int | None = None) -> Par
         pieces = [rows for part, own in zip(parts, runs, strict=True) for rows in split_rows(getattr(part, name), own)]
         fields[name] = torch.cat([pieces[order[p, q]] for *_, p, q in clouds]) if clouds else value
     return parts[0].with_clouds(table, **fields)
+
+
+def joined_clouds(particles: Particles, more: Particles) -> Particles:
+    """Appends the particles of each cloud of ``more`` to the same cloud of ``particles``, without a device sync."""
+    parts = with_same_attributes([particles, more])
+    tables = [part.clouds for part in parts]
+    runs = [[table.row_runs([q])[0] for q in range(len(table))] for table in tables]
+    fields = {}
+    for name in parts[0].row_fields():
+        pieces = (split_rows(getattr(part, name), own) for part, own in zip(parts, runs, strict=True))
+        fields[name] = torch.cat([piece for both in zip(*pieces, strict=True) for piece in both])
+    return parts[0].with_clouds(tables[0].with_counts(map(sum, zip(*(table.counts for table in tables)))), **fields)
 
 
 def single_steps(particles: Particles) -> list[Particles]:

@@ -54,18 +54,9 @@ def _is_released(section: dict[str, Any]) -> bool:
 
 
 SWITCHES = {  # former switches of the dynamics with their defaults, replaced by the list of priors
-    "position_waves": 0,
-    "motion_length": None,
-    "velocity": False,
-    "deformation": False,
-    "turning": False,
-    "pushes": False,
-    "solid": False,
-    "gravity": None,
-    "contact_length": None,
-    "lights": (),
-    "surfaces": False,
-}
+    "position_waves": 0, "motion_length": None, "velocity": False, "deformation": False, "turning": False,
+    "pushes": False, "solid": False, "gravity": None, "contact_length": None, "lights": (), "surfaces": False,
+}  # fmt: skip
 OCCLUSION = {"shading": "occlusion", "strength": 0.2, "unit": 0.1, "beam": 2.0}
 PARAMETERS = {  # former name below "dynamics." -> name below "dynamics.priors."
     "gravity": "gravity.acceleration",

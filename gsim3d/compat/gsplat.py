@@ -31,10 +31,9 @@ class Meta(dict):
 
     def __missing__(self, key: str) -> Any:
         if key in NO_TILES:
-            raise InputError(
-                f"rasterization: meta[{key!r}] is not kept: lists of tiles are made inside of the kernel, in a form of "
-                "its own; read radii, means2d, conics and depths"
-            )
+            why = "lists of tiles are made inside of the kernel, in a form of its own"
+            advice = "read radii, means2d, conics and depths"
+            raise InputError(f"rasterization: meta[{key!r}] is not kept: {why}; {advice}")
         raise KeyError(key)
 
 
@@ -149,22 +148,13 @@ def rasterization(
     no_plane = means.new_zeros(n_images)
     cameras = Cameras(viewmats.reshape(-1, 4, 4), Ks.reshape(-1, 3, 3), no_plane, no_plane, image_cloud, width, height)
     shapes = (None, None) if covars is not None else (quats.reshape(-1, 4), scales.reshape(-1, 3))
+    limits = {"near_plane": near_plane, "far_plane": far_plane, "radius_clip": radius_clip, "dilation": eps2d}
+    options = {"lens": lens, "distortion": distortion, "jacobian": "clamped", "antialiased": antialiased, **limits}
+    options["cu_rows"] = torch.arange(n_batches + 1, device=means.device) * n
+    options["covars"] = None if covars is None else covars.reshape(-1, 3, 3)
+    flat_opacities = opacities.reshape(-1)
     projection = project_gaussians(
-        means.reshape(-1, 3),
-        *shapes,
-        cameras,
-        covars=None if covars is None else covars.reshape(-1, 3, 3),
-        opacities=opacities.reshape(-1),
-        lens=lens,
-        distortion=distortion,
-        cu_rows=torch.arange(n_batches + 1, device=means.device) * n,
-        n_pairs=n_images * n,
-        near_plane=near_plane,
-        far_plane=far_plane,
-        radius_clip=radius_clip,
-        dilation=eps2d,
-        jacobian="clamped",
-        antialiased=antialiased,
+        means.reshape(-1, 3), *shapes, cameras, opacities=flat_opacities, n_pairs=n_images * n, **options
     )
     values = means.new_zeros(n_images * n, 0)
     if with_color:
@@ -224,18 +214,15 @@ def _lens(lens: str, radial: Tensor | None, tangential: Tensor | None, n_images:
     if lens == "fisheye" and tangential is None:
         return lens, radial.reshape(n_images, -1)
     if lens != "pinhole":
-        raise InputError(
-            "rasterization: radial_coeffs are of camera_model pinhole and fisheye, tangential_coeffs of pinhole"
-        )
+        known = "radial_coeffs are of camera_model pinhole and fisheye, tangential_coeffs of pinhole"
+        raise InputError(f"rasterization: {known}")
     like = radial if tangential is None else tangential
     zeros = like.new_zeros(n_images, 6)
     k = zeros if radial is None else radial.reshape(n_images, -1)
     p = zeros[:, :2] if tangential is None else tangential.reshape(n_images, -1)
     if k.shape[1] not in (4, 6) or p.shape[1] != 2:
-        raise ValueError(
-            "rasterization: radial_coeffs must be [..., C, 6] or [..., C, 4] and tangential_coeffs [..., C, 2]; got "
-            f"{k.shape[1]} and {p.shape[1]} of each camera"
-        )
+        wanted = "radial_coeffs must be [..., C, 6] or [..., C, 4] and tangential_coeffs [..., C, 2]"
+        raise ValueError(f"rasterization: {wanted}; got {k.shape[1]} and {p.shape[1]} of each camera")
     return "opencv", torch.cat([k[:, :2], p, k[:, 2:], zeros[:, k.shape[1] :]], 1)
 
 
@@ -248,17 +235,13 @@ def _colors(colors: Tensor | None, sh_degree: int | None, means: Tensor, viewmat
         if colors.shape[:-1] == (*batch, n):
             colors = colors[..., None, :, :].expand(*batch, n_cameras, n, colors.shape[-1])
         if colors.shape[:-1] != (*batch, n_cameras, n):
-            raise ValueError(
-                f"rasterization: colors must be {[*batch, n, 'D']} or {[*batch, n_cameras, n, 'D']}; got "
-                f"{list(colors.shape)}"
-            )
+            wanted = f"{[*batch, n, 'D']} or {[*batch, n_cameras, n, 'D']}"
+            raise ValueError(f"rasterization: colors must be {wanted}; got {list(colors.shape)}")
         return colors
     shared, n_terms = colors.dim() == 3, (sh_degree + 1) ** 2
     if colors.shape[:-2] not in ((n,), (*batch, n)) or not 0 <= sh_degree <= 4 or colors.shape[-2] < n_terms:
-        raise ValueError(
-            f"rasterization: with sh_degree={sh_degree} (0 to 4) colors must be [N={n}, K >= {n_terms}, D]; got "
-            f"{list(colors.shape)}"
-        )
+        wanted = f"with sh_degree={sh_degree} (0 to 4) colors must be [N={n}, K >= {n_terms}, D]"
+        raise ValueError(f"rasterization: {wanted}; got {list(colors.shape)}")
     sh = colors[..., :n_terms, :]
     turned, moved = viewmats[..., :3, :3], viewmats[..., :3, 3]
     centre = -(turned.mT @ moved[..., None])[..., 0]

@@ -14,21 +14,13 @@ from torch import Tensor
 from gsim3d.compat.released_harmonics import published_axes
 from gsim3d.dynamics.step import StateLayout
 from gsim3d.math.spherical_harmonics import rotate_harmonics
+from gsim3d.nn.point_transformer_v3 import OF_BLOCK
 from gsim3d.presets import ModelConfig
 
 ENCODER, DYNAMICS, HEAD = "encoder.", "dynamic_model.net.", "decoder."  # name prefixes of the published model
 _COUNTER = "num_batches_tracked"  # unused buffer of batch norms
 
 # (published, ours) prefixes; # stands for a number. The first matching pair applies, in either direction.
-_BLOCK = [
-    ("cpe.0", "position.conv"),
-    ("cpe.1", "position.linear"),
-    ("cpe.2", "position.norm"),
-    ("norm1.0", "norm1"),
-    ("attn", "attention"),
-    ("norm2.0", "norm2"),
-    ("mlp.0", "mlp"),
-]
 _DYNAMICS = [
     ("embedding.stem", "stem"),
     ("enc.enc#.down.proj", "encoder.#.pool.proj"),
@@ -38,8 +30,8 @@ _DYNAMICS = [
     ("dec.dec#.up.proj.1", "decoder.#.unpool.proj_norm"),
     ("dec.dec#.up.proj_skip.0", "decoder.#.unpool.skip"),
     ("dec.dec#.up.proj_skip.1", "decoder.#.unpool.skip_norm"),
-    *((f"enc.enc#.block#.{theirs}", f"encoder.#.blocks.#.{ours}") for theirs, ours in _BLOCK),
-    *((f"dec.dec#.block#.{theirs}", f"decoder.#.blocks.#.{ours}") for theirs, ours in _BLOCK),
+    *((f"enc.enc#.block#.{theirs}", f"encoder.#.blocks.#.{ours}") for ours, theirs in OF_BLOCK.items()),
+    *((f"dec.dec#.block#.{theirs}", f"decoder.#.blocks.#.{ours}") for ours, theirs in OF_BLOCK.items()),
     ("dec.{head}.norm_pre", "head.norm"),
     ("dec.{head}", "head"),
 ]

@@ -44,6 +44,7 @@ FIXED = {
     "model.state_adapter.gaussians": {"rotations": 4},
 }  # fmt: skip
 NO_MEANING = object()
+OF_ANOTHER = "this configuration belongs to another checkpoint"
 
 
 @dataclass(frozen=True)
@@ -78,10 +79,10 @@ class _Settings:
         for key in path.split("."):
             if not isinstance(value, dict) or key not in value:
                 if default is NO_MEANING:
-                    raise InputError(
-                        f"{path}: is missing; use the resolved configuration that is saved with a checkpoint, not the "
-                        "overrides of an experiment"
+                    advice = (
+                        "the resolved configuration that is saved with a checkpoint, not the overrides of an experiment"
                     )
+                    raise InputError(f"{path}: is missing; use {advice}")
                 return default
             value = value[key]
         return value
@@ -198,17 +199,10 @@ def read_config(content: dict, shapes: Shapes) -> ReleasedConfig:
     scales = {f"scale_{end}": settings.positive(f"model.state_adapter.gaussians.scale_{end}") for end in ("min", "max")}
     try:
         encoder = EncoderConfig(**_encoder(settings, sizes), dynamic_dim=n_dynamic, static_dim=n_static, **common)
-        dynamics = ReleasedDynamicsConfig(
-            **_dynamics(settings, sizes),
-            **updates,
-            dynamic_latents=n_dynamic,
-            static_latents=n_static,
-            history_bits=history.bit_length() - 1,
-            **scales,
-            **common,
-        )
-        latents = 0 if explicit else n_dynamic + n_static
-        renderer = RendererConfig(latents=latents, sh_degree=sh_degree, jacobian="clamped", **scales)
+        latents = {"dynamic_latents": n_dynamic, "static_latents": n_static, "history_bits": history.bit_length() - 1}
+        dynamics = ReleasedDynamicsConfig(**_dynamics(settings, sizes), **updates, **latents, **scales, **common)
+        read = 0 if explicit else n_dynamic + n_static
+        renderer = RendererConfig(latents=read, sh_degree=sh_degree, jacobian="clamped", **scales)
         model = ReleasedModelConfig(encoder, dynamics, renderer)
     except ValueError as error:
         raise InputError(f"settings and weights do not describe a valid model: {error}") from None
@@ -221,16 +215,12 @@ def _is_explicit(settings: _Settings, sizes: _Sizes) -> bool:
     params = settings.names("model.state_adapter.state_3dgs_params")
     explicit = sizes.needed(f"{ENCODER}depth_predictor.to_gaussians.2.weight") > 2
     if params not in ({"means", "opacities"}, EXPLICIT):
-        raise InputError(
-            "model.state_adapter.state_3dgs_params: must be means and opacities, or all five parameters; "
-            f"got {', '.join(sorted(params))}"
-        )
+        wanted, got = "means and opacities, or all five parameters", ", ".join(sorted(params))
+        raise InputError(f"model.state_adapter.state_3dgs_params: must be {wanted}; got {got}")
     if explicit != (params == EXPLICIT):
         given, found = ("latent", "explicit") if explicit else ("explicit", "latent")
-        raise InputError(
-            f"model.state_adapter.state_3dgs_params describes the {given} variant, but the weights are of the {found} "
-            "one: this configuration belongs to another checkpoint"
-        )
+        said = f"describes the {given} variant, but the weights are of the {found} one"
+        raise InputError(f"model.state_adapter.state_3dgs_params {said}: {OF_ANOTHER}")
     return explicit
 
 
@@ -249,9 +239,8 @@ def _updates(settings: _Settings, sizes: _Sizes, explicit: bool, n_dynamic: int,
     changing = {"means"} | (settings.names(f"{adapter}.dynamic_state_keys") & EXPLICIT)
     if explicit and changing != EXPLICIT:
         missing = ", ".join(sorted(EXPLICIT - changing))
-        raise InputError(
-            f"{adapter}.dynamic_state_keys: must contain all attributes of explicit particles; {missing} is missing"
-        )
+        wanted = "must contain all attributes of explicit particles"
+        raise InputError(f"{adapter}.dynamic_state_keys: {wanted}; {missing} is missing")
     if not explicit and "opacities" in changing:
         raise InputError(f"{adapter}.dynamic_state_keys: changing opacities are not supported in the latent variant")
     changing = (EXPLICIT if explicit else {"means"}) | ({"dynamic_latent_features"} if n_dynamic else set())
@@ -274,10 +263,8 @@ def _updates(settings: _Settings, sizes: _Sizes, explicit: bool, n_dynamic: int,
     width = n_dynamic + 3 + (3 * (sh_degree + 1) ** 2 + 1 + turn + 3 if explicit else 0)
     rows = sizes.needed(f"{DYNAMICS}dec.{_n_stages(sizes) - 1}.fc2.weight")
     if rows % width:
-        raise InputError(
-            f"weights: the dynamics predicts {rows} values per particle, but a step of this variant needs {width}: "
-            "this configuration belongs to another checkpoint"
-        )
+        said = f"the dynamics predicts {rows} values per particle, but a step of this variant needs {width}"
+        raise InputError(f"weights: {said}: {OF_ANOTHER}")
     steps_per_call = sizes.agreed("dataset.n_step_predict_multiple", rows // width, 1)
     metric = settings.positive(f"{adapter}.metric")
     max_step = metric / 2 if settings.flag(f"{adapter}.pred_inductive_bias") else None
@@ -347,18 +334,14 @@ def _dynamics(settings: _Settings, sizes: _Sizes) -> dict[str, Any]:
     if settings.wholes(f"{net}.dec_patch_size", n - 1) != patches[:-1]:
         raise InputError(f"{net}.dec_patch_size: must equal enc_patch_size at the same stages")
     first = f"{DYNAMICS}enc.enc0.block0.mlp.0.fc1.weight"
+    sides = {}
+    for name, side, n_here in (("encoder", "enc", n), ("decoder", "dec", n - 1)):
+        heads = settings.wholes(f"{net}.{side}_num_head", n_here)
+        sides |= {f"{name}_depths": depths[side], f"{name}_channels": channels[side], f"{name}_heads": heads}
     return {
+        **{"strides": strides, "merge_windows": windows, "patch_sizes": patches, "time_embedding": time_embedding},
+        **sides,
         "grid_size": settings.positive(f"{net}.grid_size"),
-        "strides": strides,
-        "merge_windows": windows,
-        "patch_sizes": patches,
-        "time_embedding": time_embedding,
-        "encoder_depths": depths["enc"],
-        "encoder_channels": channels["enc"],
-        "encoder_heads": settings.wholes(f"{net}.enc_num_head", n),
-        "decoder_depths": depths["dec"],
-        "decoder_channels": channels["dec"],
-        "decoder_heads": settings.wholes(f"{net}.dec_num_head", n - 1),
         "mlp_ratio": sizes.agreed(f"{net}.mlp_ratio", sizes.needed(first) // sizes.needed(first, 1)),
         "drop_path": settings.number(f"{net}.drop_path", 0.3),
         "shuffle_orders": settings.flag(f"{net}.shuffle_orders", True),
@@ -377,14 +360,8 @@ def _data(settings: _Settings, history: int, size_multiple: int) -> tuple[dict[s
     if width % size_multiple or height % size_multiple:
         raise InputError(f"dataset.image_shape: must be multiples of {size_multiple}; got {height}, {width}")
     views, notes = _views(settings)
-    data = {
-        "history": history,
-        **views,
-        "image_size": [width, height],
-        "resize": [width, height],
-        "near_far": [near, far],
-        "unit_cameras": settings.flag("dataset.make_baseline_1", False),
-    }
+    data = {"history": history, **views, "image_size": [width, height], "resize": [width, height]}
+    data |= {"near_far": [near, far], "unit_cameras": settings.flag("dataset.make_baseline_1", False)}
     with_seg = settings.flag("dataset.with_seg", False)
     effects = EffectsSpec(dynamics=DynamicsEffects(background="frozen" if with_seg else "dynamic"))
     if not with_seg:
@@ -416,9 +393,5 @@ def _views(settings: _Settings) -> tuple[dict[str, Any], list[str]]:
     count = settings.whole(f"{sampler}.num_context_views")
     if inputs:  # all test views, or the requested number of the views to draw from
         count = len(inputs) if fixed else min(count, len(inputs))
-    views = {
-        "context_views": count,
-        "context_cameras": inputs,
-        "target_only_cameras": [cam for cam in targets if cam not in inputs],
-    }
-    return views, notes
+    target_only = [cam for cam in targets if cam not in inputs]
+    return {"context_views": count, "context_cameras": inputs, "target_only_cameras": target_only}, notes

@@ -98,10 +98,9 @@ class _Unpickler(pickle.Unpickler):
             return _KNOWN[full]
         if full in _PLACEHOLDER_NAMES or module.split(".")[0] in _PLACEHOLDER_PACKAGES:
             return Ignored
-        raise InputError(
-            f"{self.path}: rejected: it references {full}, which is not part of a checkpoint's weights and could run "
-            "code; do not load this file with other programs either, unless you trust its source"
-        )
+        said = f"it references {full}, which is not part of a checkpoint's weights and could run code"
+        advice = "do not load this file with other programs either, unless you trust its source"
+        raise InputError(f"{self.path}: rejected: {said}; {advice}")
 
     def persistent_load(self, pid: Any) -> tuple[str, torch.dtype]:
         match pid:

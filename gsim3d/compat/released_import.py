@@ -82,9 +82,8 @@ def import_released(path: str | Path, settings: dict) -> Imported:
         check_shapes(shapes, expected, file.path)
         published = {name: file.read(stored[name]) for name in expected if name in stored}
     weights = from_published(published, config.model)
-    n_parameters = sum(
-        value.numel() for name, value in published.items() if not re.search(r"running_|num_batches", name)
-    )
+    trained = [name for name in published if not re.search(r"running_|num_batches", name)]
+    n_parameters = sum(published[name].numel() for name in trained)
     ignored = tuple(name for name in stored if name not in expected)
     return Imported(config, weights, n_parameters, ignored, counts, untrained_signs(published))
 
@@ -99,11 +98,8 @@ def published_shapes(config: ModelConfig) -> Shapes:
 def check_shapes(found: Shapes, expected: Shapes, where: Path) -> None:
     """Raises InputError if tensors are missing or have the wrong shape; the message names them."""
     missing = [name for name in expected if name not in found and not name.endswith("num_batches_tracked")]
-    wrong = [
-        f"{name} is {list(found[name])} instead of {list(shape)}"
-        for name, shape in expected.items()
-        if name in found and found[name] != shape
-    ]
+    different = {name: shape for name, shape in expected.items() if found.get(name, shape) != shape}
+    wrong = [f"{name} is {list(found[name])} instead of {list(shape)}" for name, shape in different.items()]
     unexpected = [name for name in found if name not in expected]
     if missing or wrong:
         groups = {"missing": missing, "of another shape": wrong, "unexpected": unexpected}
@@ -164,11 +160,8 @@ def write_imported(source: str | Path, settings_file: str | Path, out: str | Pat
         raise InputError(message if message.startswith(str(source)) else f"{settings_file}: {message}") from None
     config, effects = imported.config, imported.config.effects
     origin = {"file": source.name, "untrained_blocks": imported.signs.blocks, "notes": list(config.notes)}
-    saved = {
-        "model": to_dict(config.model),
-        "data": config.data,
-        "effects": {"spec": effects.to_dict(), "hash": effects.hash},
-    }
+    of_effects = {"spec": effects.to_dict(), "hash": effects.hash}
+    saved = {"model": to_dict(config.model), "data": config.data, "effects": of_effects}
     state = {"step": imported.counts.get("global_step", 0), "imported": origin}
     checkpoint.write(with_parents(out), checkpoint.Checkpoint(model=imported.weights, config=saved, state=state))
     return f"{_report(imported)}\nwritten: {out}"

@@ -11,7 +11,7 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -53,22 +53,14 @@ class ReleasedDynamicsConfig(DynamicsConfig):
     orientation (with one step per call).
     """
 
+    origin_of_scene: ClassVar[bool] = False
+    slots_from_newest: ClassVar[bool] = False
+    max_opacity: ClassVar[float] = LARGEST
+
     def __post_init__(self):
         super().__post_init__()
         if self.background != "symmetric" or self.priors:
             raise ValueError('ReleasedDynamicsConfig: background must be "symmetric", and there must be no priors')
-
-    @property
-    def origin_of_scene(self) -> bool:
-        return False
-
-    @property
-    def slots_from_newest(self) -> bool:
-        return False
-
-    @property
-    def max_opacity(self) -> float:
-        return LARGEST
 
     @property
     def frozen_turn(self) -> bool:
@@ -172,19 +164,9 @@ class ReleasedHead(GaussianHead):
         return sh, quats, scales
 
 
-COUNTERPARTS = {
-    released.__base__: released
-    for released in (
-        ReleasedTransformer,
-        ReleasedCostVolume,
-        ReleasedDepthPredictor,
-        ReleasedHeads,
-        ReleasedSparseConv,
-        ReleasedAttention,
-        ReleasedDecoderStage,
-        ReleasedHead,
-    )
-}
+_OF_ENCODER = ReleasedTransformer, ReleasedCostVolume, ReleasedDepthPredictor, ReleasedHeads
+_OTHERS = ReleasedSparseConv, ReleasedAttention, ReleasedDecoderStage, ReleasedHead
+COUNTERPARTS = {released.__base__: released for released in (*_OF_ENCODER, *_OTHERS)}
 
 
 def as_released(network: Module, without: Collection[type] = ()) -> Module:
@@ -209,9 +191,7 @@ class ReleasedSimulator(Simulator):
     def plan(self, spec: EffectsSpec | None = None) -> Plan:
         spec = self.effects if spec is None else spec
         if spec.outputs.features or not spec.outputs.rgb:
-            raise UnsupportedEffect(
-                "unsupported effect outputs: the published renderer renders colours only, no features"
-            )
+            raise UnsupportedEffect("unsupported effect outputs: the published renderer renders colours, no features")
         return super().plan(spec)
 
     def _rasterized(self, gaussians: Gaussians, cameras: Cameras, background: Tensor | None, **options) -> Rendering:
@@ -260,23 +240,11 @@ def render_released(
         camera = with_centered_principal_point(cameras.select(one, torch.zeros_like(one)))
         cloud = int(cameras.image_cloud[i])
         first, end = gaussians.cu_rows[cloud : cloud + 2].tolist()
-        means, quats, scales, opacities, sh = (
-            getattr(gaussians, name)[first:end] for name in ("means", "quats", "scales", "opacities", "sh")
-        )
-        images.append(
-            ops.rasterize_gaussians(
-                means,
-                quats,
-                scales,
-                opacities,
-                camera,
-                colors=released_colors(sh, means, camera),
-                background=background if background is None or background.dim() == 1 else background[one],
-                near_plane=NEAR_SHARE * float(camera.near),
-                cutoff="tile3sigma",
-                jacobian=jacobian,
-            )
-        )
+        *rows, sh = (getattr(gaussians, name)[first:end] for name in ("means", "quats", "scales", "opacities", "sh"))
+        behind = background if background is None or background.dim() == 1 else background[one]
+        options = {"near_plane": NEAR_SHARE * float(camera.near), "cutoff": "tile3sigma", "jacobian": jacobian}
+        colors = released_colors(sh, rows[0], camera)
+        images.append(ops.rasterize_gaussians(*rows, camera, colors=colors, background=behind, **options))
     if not images:
         empty = gaussians.means.new_empty(0, cameras.height, cameras.width)
         return Rendering(empty.new_empty(*empty.shape, 3), empty, empty, None)

@@ -16,17 +16,7 @@ from torch import Tensor, nn
 
 from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.errors import InputError
-from gsim3d.state import (
-    ASLEEP,
-    DYNAMIC,
-    Actions,
-    CloudTable,
-    Particles,
-    constant,
-    split_rows,
-    take_runs,
-    with_same_attributes,
-)
+from gsim3d.state import ASLEEP, DYNAMIC, Actions, Particles, constant, joined_clouds, take_runs
 
 # Standard deviations of the initial weights. A point is one of hundreds of particles: of a single ball that moves as
 # prescribed, the preset tiny learned nothing from displacements in 3000 steps with 0.5, and enough in 1000 with 2.5.
@@ -58,17 +48,7 @@ class ActionParticles(nn.Module):
         Raises:
             InputError: the model does not know the type of a point.
         """
-        points = self._points(history, acting)
-        given, points = with_same_attributes([history, points])
-        tables = given.clouds, points.clouds
-        runs = [[table.row_runs([q])[0] for q in range(len(table))] for table in tables]
-        fields = {}
-        for name, value in given.row_fields().items():
-            pieces = zip(split_rows(value, runs[0]), split_rows(getattr(points, name), runs[1]), strict=True)
-            fields[name] = torch.cat([piece for both in pieces for piece in both])
-        counts = (own + more for own, more in zip(tables[0].counts, tables[1].counts, strict=True))
-        table = CloudTable.make(counts, tables[0].scenes, tables[0].steps, history.cu_rows.device)
-        return given.with_clouds(table, **fields)
+        return joined_clouds(history, self._points(history, acting))
 
     @staticmethod
     def removed(step: Particles) -> Particles:
@@ -76,8 +56,7 @@ class ActionParticles(nn.Module):
         table, n_points = step.clouds, step.actions.n_points
         runs = [(begin, until - n_points) for begin, until in zip(table.starts, table.starts[1:], strict=False)]
         fields = {name: take_runs(value, runs) for name, value in step.row_fields().items()}
-        counts = (until - begin for begin, until in runs)
-        return step.with_clouds(CloudTable.make(counts, table.scenes, table.steps, step.cu_rows.device), **fields)
+        return step.with_clouds(table.with_counts(until - begin for begin, until in runs), **fields)
 
     def _points(self, history: Particles, acting: tuple[str, ...]) -> Particles:
         """The action particles of all clouds; those that a scene does not have there are asleep."""
@@ -89,26 +68,16 @@ class ActionParticles(nn.Module):
         moved = (torch.where(stays, 0, coming.to(like) - now) / self.cell)[..., None]
         latents = self.embedding[types.clamp_min(0)] + (moved * self.displacement).sum(-2)
         latents = latents.flatten(0, 1).to(history.dynamic_latents)
-        counts = CloudTable.make((actions.n_points,) * len(table), table.scenes, table.steps, history.cu_rows.device)
-        cu_rows, scene, step = counts.tensors
-        return Particles(
-            means=now.flatten(0, 1),
-            opacities=torch.ones_like(latents[:, 0]),
-            dynamic_latents=latents[:, : self.n_dynamic],
-            static_latents=latents[:, self.n_dynamic :],
-            cu_rows=cu_rows,
-            cloud_scene=scene,
-            cloud_step=step,
-            activity=torch.where(types.flatten() < 0, ASLEEP, DYNAMIC).to(torch.uint8),
-            origin=history.origin,
-            known=counts,
-        )
+        known = table.with_counts((actions.n_points,) * len(table))
+        activity = torch.where(types.flatten() < 0, ASLEEP, DYNAMIC).to(torch.uint8)
+        dynamic, static = latents.split([self.n_dynamic, latents.shape[1] - self.n_dynamic], 1)
+        rows = now.flatten(0, 1), torch.ones_like(latents[:, 0]), dynamic, static
+        return Particles(*rows, *known.tensors, activity=activity, origin=history.origin, known=known)
 
     def _index(self, actions: Actions, acting: tuple[str, ...]) -> Tensor:
         """int64: index into ``types`` of each of the actions' types; -1 (also its last entry): not acting."""
         if unknown := [name for name in actions.names if name not in self.types]:
-            raise InputError(
-                f"actions: the model does not know the type {unknown[0]!r}; it has {', '.join(self.types)}"
-            )
+            known = ", ".join(self.types)
+            raise InputError(f"actions: the model does not know the type {unknown[0]!r}; it has {known}")
         index = tuple(self.types.index(name) if name in acting else -1 for name in actions.names)
         return constant((*index, -1), actions.types.device)  # a type of -1 reads the last entry

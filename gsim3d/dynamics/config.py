@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from gsim3d.errors import InputError, check_ranges
 from gsim3d.nn.graph_network import MAX_HISTORY_BITS, GraphConfig, graph_spec
@@ -65,14 +66,16 @@ class DynamicsConfig(TransformerConfig):
     shuffle_orders: bool = True
     actions: tuple[str, ...] = ()
 
+    max_opacity: ClassVar[float] = 1.0  # largest opacity of a particle
+    frozen_turn: ClassVar[bool] = False  # whether the orientation of frozen explicit particles changes
+
     def __post_init__(self):
         super().__post_init__()
         if self.predicts not in PREDICTS:
             raise ValueError(f"DynamicsConfig: predicts must be one of {', '.join(PREDICTS)}; got {self.predicts!r}")
         if self.background not in BACKGROUNDS:
-            raise ValueError(
-                f"DynamicsConfig: background must be one of {', '.join(BACKGROUNDS)}; got {self.background!r}"
-            )
+            known = ", ".join(BACKGROUNDS)
+            raise ValueError(f"DynamicsConfig: background must be one of {known}; got {self.background!r}")
         if self.is_asymmetric and self.norm == "batch":
             raise ValueError('DynamicsConfig: background="asymmetric" needs norm="layer"')
         if self.is_relightable and self.explicit:
@@ -80,9 +83,8 @@ class DynamicsConfig(TransformerConfig):
         if self.graph is not None and (self.norm == "batch" or self.is_asymmetric):
             raise InputError('DynamicsConfig: graph needs norm="layer", and background="symmetric" or "relightable"')
         if self.graph is not None and self.history_bits > MAX_HISTORY_BITS:
-            raise InputError(
-                f"DynamicsConfig: graph needs history_bits of at most {MAX_HISTORY_BITS}; got {self.history_bits}"
-            )
+            most = f"history_bits of at most {MAX_HISTORY_BITS}"
+            raise InputError(f"DynamicsConfig: graph needs {most}; got {self.history_bits}")
         if self.steps_per_call < 1:
             raise ValueError(f"DynamicsConfig: steps_per_call must be at least 1; got {self.steps_per_call}")
         check_ranges(self, position_length=(1e-6, 1e6), scale_max=(1e-6, 1e6), scale_min=(0, self.scale_max))
@@ -133,13 +135,3 @@ class DynamicsConfig(TransformerConfig):
     @property
     def is_relightable(self) -> bool:
         return self.background == "relightable"
-
-    @property
-    def max_opacity(self) -> float:
-        """Largest opacity of a particle."""
-        return 1.0
-
-    @property
-    def frozen_turn(self) -> bool:
-        """Whether the orientation of frozen explicit particles changes."""
-        return False

@@ -100,16 +100,8 @@ class FrozenContext:
         spec: PyramidSpec,
         curves: tuple[tuple[int, ...], ...] | None = None,
     ) -> tuple[FrozenContext, list[Recorder]]:
-        """Starts a context for the background ``particles``.
-
-        Args:
-            pyramid: geometry of the background.
-            particles: background, at most one cloud a scene.
-            spec: strides and patch sizes of the pyramid.
-            curves: indices of the curves of each level; None: all in order.
-        Returns:
-            The context, and for each level the recorder that fills it in a call of the network.
-        """
+        """Starts a context for the background ``particles``, at most one cloud a scene, of geometry ``pyramid``.
+        Also returns for each level the recorder that fills it in a call of the network."""
         curves = (ALL_CURVES,) * len(pyramid.stages) if curves is None else curves
         depths = tuple(DEPTH + 1 - n.bit_length() for n in accumulate((1, *spec.strides), operator.mul))
         if pyramid.rows.shape[0] == 0:
@@ -132,18 +124,13 @@ class FrozenContext:
 
     def map(self, f: Callable[[Tensor, int], Tensor]) -> FrozenContext:
         """Applies ``f`` to every tensor and its kind (KEYS, LISTS, OFFSETS or ROWS)."""
-        places = tuple(
-            Places(
-                {size: f(cells, KEYS) for size, cells in at.cells.items()},
-                f(at.first, KEYS),
-                f(at.kv_rows, LISTS),
-                f(at.cu_k, OFFSETS),
-                at.patch_size,
-            )
-            for at in self.places
-        )
+        places = []
+        for at in self.places:
+            cells = {size: f(cells, KEYS) for size, cells in at.cells.items()}
+            lists = f(at.first, KEYS), f(at.kv_rows, LISTS), f(at.cu_k, OFFSETS)
+            places.append(Places(cells, *lists, at.patch_size))
         kept = ({module: f(x, ROWS) for module, x in part.items()} for part in (self.fields, self.keys, self.values))
-        return FrozenContext(self.curves, self.depths, places, *kept)
+        return FrozenContext(self.curves, self.depths, tuple(places), *kept)
 
     def with_capacity(self, factor: float) -> FrozenContext:
         """An equivalent context, padded to ``factor`` times its sizes."""

@@ -78,11 +78,9 @@ class Dynamics(nn.Module):
         """Builds the integer geometry of a call from the positions.
 
         Args:
-            history: as :meth:`forward`.
-            generator: as :meth:`forward`.
-            capacity: sizes of the result, which avoid a device sync; None: exact sizes.
+            history, generator: as :meth:`forward`.
+            capacity, rounded: as :func:`gsim3d.ops.build_pyramid`.
             curves: indices of the curves of each level; None: drawn from ``generator``.
-            rounded: as in :func:`gsim3d.ops.build_pyramid`.
         """
         clouds = history.clouds
         slots, history_bits = self._slots(clouds, newest_clouds(clouds))
@@ -95,15 +93,8 @@ class Dynamics(nn.Module):
         if capacity is not None and capacity.sizes[0] < history.n_rows:
             chosen, cu_rows, is_row, n_seen = _seen_first(seen, cu_rows, capacity.sizes[0])
             places = torch.where(is_row[:, None], places[chosen], torch.nan)
-        pyramid = ops.build_pyramid(
-            places,
-            cu_rows,
-            history.cloud_scene,
-            constant(slots, cu_rows.device),
-            history.origin,
-            self.config.pyramid_spec(history_bits),
-            **options,
-        )
+        clouds = history.cloud_scene, constant(slots, cu_rows.device), history.origin
+        pyramid = ops.build_pyramid(places, cu_rows, *clouds, self.config.pyramid_spec(history_bits), **options)
         return pyramid if chosen is None else pyramid.of_rows(chosen, n_seen)
 
     @contextlib.contextmanager
@@ -126,14 +117,8 @@ class Dynamics(nn.Module):
         return min(history.n_rows, math.ceil(SLACK * int(self._seen(history).sum())))
 
     def remember(self, background: Particles, *, generator: torch.Generator | None = None) -> FrozenContext:
-        """Computes the context of a static background, for all calls until it changes.
-
-        Args:
-            background: at most one cloud a scene.
-            generator: as :meth:`forward`.
-        Gradients:
-            As :meth:`forward`.
-        """
+        """Computes the context of a static ``background``, at most one cloud a scene, for all calls until it changes;
+        ``generator`` and gradients as :meth:`forward`."""
         curves = self._draw_curves(generator)
         pyramid = self.geometry(background, curves=curves)
         context, recorders = FrozenContext.begin(pyramid, background, self.config.pyramid_spec(0), curves)
@@ -146,13 +131,8 @@ class Dynamics(nn.Module):
         return context
 
     def observe(self, particles: Particles, frames: Frames, n_views: int | None = None) -> Particles:
-        """Initializes attributes of priors after encoding.
-
-        Args:
-            particles: particles encoded from ``frames``.
-            frames: input images.
-            n_views: number of images of every cloud, if equal and in order of clouds; avoids a device sync.
-        """
+        """Initializes attributes of priors of ``particles`` that were encoded from ``frames``. ``n_views``: number of
+        images of every cloud, if equal and in order of clouds, which avoids a device sync."""
         for prior in self.priors:
             ctx = self.context(particles)
             ctx.n_views = n_views
@@ -234,9 +214,8 @@ class Dynamics(nn.Module):
         """Outputs and gains of the network for the newest particles, from :meth:`StateLayout.split`."""
         history, n_data = ctx.history, [stage.n_data for stage in pyramid.stages]
         if pyramid.found is not None and self.training and self.config.norm == "batch" and None in n_data:
-            raise ValueError(
-                'Dynamics: norm="batch" cannot be trained with a pyramid of given capacity; use norm="layer"'
-            )
+            said = 'norm="batch" cannot be trained with a pyramid of given capacity; use norm="layer"'
+            raise ValueError(f"Dynamics: {said}")
         x = self._features(ctx)
         n_seen = pyramid.rows.shape[0] if pyramid.found is None else n_data[0]
         all_seen = n_seen == history.n_rows
@@ -245,10 +224,8 @@ class Dynamics(nn.Module):
         contexts = () if background is None else background.readers(pyramid, history)
         x = self.net(x, pyramid, generator=self._draws(generator, x.device), contexts=contexts)
         if not all_seen:
-            one = x.new_ones(x.shape[0], 1)
-            x, seen = (
-                ops.unpool(values, pyramid.rows, pyramid.cu_rows, history.n_rows, check=False) for values in (x, one)
-            )
+            both, lists = (x, x.new_ones(x.shape[0], 1)), (pyramid.rows, pyramid.cu_rows)
+            x, seen = (ops.unpool(values, *lists, history.n_rows, check=False) for values in both)
             ctx.awake = ctx.select_newest(seen)[:, 0] > 0
         prediction = self.net.head(ctx.select_newest(x), self.layout.columns(ctx.changes))
         return self.layout.split(prediction, ctx.changes)
@@ -308,14 +285,13 @@ class Dynamics(nn.Module):
     def _forward_in_parts(
         self, history: Particles, generator: torch.Generator | None, changes: Mapping[str, str]
     ) -> Particles:
-        parts, n_steps = Partition.of(history, asymmetric=True), self.config.steps_per_call
-        steps = [None] * n_steps
+        parts, steps = Partition.of(history, asymmetric=True), [None] * self.config.steps_per_call
         if not parts.nothing_moves:
             background = self.remember(parts.background, generator=generator)
             step = self(parts.moving, generator=generator, background=background, changes=changes)
             steps = single_steps(step)
         steps = [parts.whole(step, 1 + i) for i, step in enumerate(steps)]
-        return steps[0] if n_steps == 1 else concatenate(steps)
+        return steps[0] if len(steps) == 1 else concatenate(steps)
 
     def _slots(self, clouds: CloudTable, newest: list[int]) -> tuple[tuple[int, ...], int]:
         """Time slot of each cloud, and the number of bits of a slot (0 if no scene has several steps)."""
@@ -337,10 +313,8 @@ class Dynamics(nn.Module):
         shuffles = self.config.shuffle_orders and self.config.graph is None
         if generator is None or not (self.training and shuffles):
             return None
-        return tuple(
-            tuple(torch.randperm(4, generator=generator, device=generator.device).tolist())
-            for _ in range(self.config.n_stages)
-        )
+        draws = (torch.randperm(4, generator=generator, device=generator.device) for _ in range(self.config.n_stages))
+        return tuple(tuple(draw.tolist()) for draw in draws)
 
 
 def _seen_first(seen: Tensor, cu_rows: Tensor, n_rows: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:

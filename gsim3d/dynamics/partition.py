@@ -30,12 +30,9 @@ class Partition:
     def of(cls, history: Particles, *, asymmetric: bool, asleep: Tensor | None = None) -> Partition:
         """Splits ``history``; needs a device sync, to count particles.
 
-        Args:
-            history: clouds sorted by (scene, step).
-            asymmetric: frozen particles are static and form the background. Otherwise they count as moving, since their
-                latents change, and only whole scenes may be asleep.
-            asleep: bool, sleeping particles of the newest clouds, static as well. All clouds of a scene must then have
-                the same particles.
+        If ``asymmetric``, frozen particles are static and form the background. Otherwise they count as moving, since
+        their latents change, and only whole scenes may be asleep. ``asleep``: bool, sleeping particles of the newest
+        clouds, static as well; all clouds of a scene must then have the same particles.
         """
         newest, background = last_steps(history, 1), None
         if not asymmetric and asleep is None:

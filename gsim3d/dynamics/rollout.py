@@ -41,19 +41,14 @@ def rollout_in_parts(
     sleepers: Sleepers | None = None,
     log: RestLog | None = None,
 ) -> list[Particles]:
-    """:func:`rollout` in which ``predict`` advances the moving particles only.
+    """:func:`rollout` in which ``predict`` advances the moving particles only, with the background.
 
     Args:
-        predict: last steps of the moving particles, and the background -> their next step or steps.
-        history: initial steps.
-        n_steps: steps to predict.
-        max_steps: largest number of steps of a scene in the input of ``predict``.
+        predict, history, n_steps, max_steps: as :func:`rollout`.
         remember: static particles -> background, computed whenever the set of static particles changes; None: the model
             is not asymmetric, and only whole scenes may sleep.
         sleepers: decides which particles fall asleep; None: no sleep.
         log: counts computed particles.
-    Returns:
-        As :func:`rollout`.
     """
     history, steps, parts = last_steps(history, max_steps), [], None
     log = RestLog() if log is None else log

@@ -71,12 +71,8 @@ class StateLayout:
         return self.config.steps_per_call * sum(n for _, n in self.outputs)
 
     def changes(self, features: str = "all", opacities: bool = True) -> dict[str, str]:
-        """Predicted attribute -> particles that a step changes: "all", "dynamic", "frozen" or "none".
-
-        Args:
-            features: particles whose latents and colours change; frozen ones may change, for example by a shadow.
-            opacities: whether predicted opacities change.
-        """
+        """Predicted attribute -> particles that a step changes: "all", "dynamic", "frozen" or "none". ``features``:
+        whose latents and colours change, of frozen ones as by a shadow; ``opacities``: whether predicted ones do."""
         names = [name for name, _ in self.outputs] + ["means"] + [changed for *_, changed in self.gains]
         changes = {name: features if name in APPEARANCE else "dynamic" for name in names}
         if "opacities" in changes and not opacities:
@@ -88,9 +84,8 @@ class StateLayout:
     def _columns(self, changes: Mapping[str, str]) -> list[tuple[str, int, bool]]:
         """(attribute or prior, channels, whether it is computed) in the order of the output channels."""
         outputs = [(name, n, changes[name] != "none") for name, n in self.outputs]
-        return outputs * self.config.steps_per_call + [
-            (prior, n, changes[changed] != "none") for prior, n, changed in self.gains
-        ]
+        gains = [(prior, n, changes[changed] != "none") for prior, n, changed in self.gains]
+        return outputs * self.config.steps_per_call + gains
 
     def columns(self, changes: Mapping[str, str]) -> list[tuple[int, int]] | None:
         """Ranges of output channels that ``changes`` needs; None: all channels."""
@@ -140,25 +135,17 @@ class StateLayout:
         awake: Tensor | None = None,
         changes: Mapping[str, str] | None = None,
     ) -> list[Particles]:
-        """Particles after each of the ``steps_per_call`` steps.
-
-        Args:
-            particles: newest state [N]; particles in ``frozen_appearance`` keep latents and colours.
-            outputs: outputs of :meth:`split`.
-            displacements: [S, N, 3] in metres.
-            awake: bool [N], particles that may change; None: all.
-            changes: of :meth:`changes`; None: all predicted attributes change.
-        """
+        """Particles after each of the ``steps_per_call`` steps from the newest state ``particles`` [N], by ``outputs``
+        of :meth:`split` and ``displacements`` [S, N, 3] in metres. Particles in ``frozen_appearance`` keep latents and
+        colours. ``awake``: bool [N], particles that may change, None: all; ``changes``: of :meth:`changes`."""
         changes = changes or self.changes()
         share = self.share(particles, "means", changes["means"], awake)
         later = {"means": hold(share, particles.means, particles.means + share * displacements)}
         for name in (name for name in outputs if name != "means"):
             share = self.share(particles, name, changes[name], awake)
             later[name] = self.later_values(name, getattr(particles, name), outputs[name], share)
-        return [
-            dataclasses.replace(particles, **{name: values[step] for name, values in later.items()})
-            for step in range(self.config.steps_per_call)
-        ]
+        steps = [{name: values[i] for name, values in later.items()} for i in range(self.config.steps_per_call)]
+        return [dataclasses.replace(particles, **step) for step in steps]
 
     @staticmethod
     def share(particles: Particles, name: str, which: str, awake: Tensor | None) -> Tensor:
@@ -171,14 +158,8 @@ class StateLayout:
         return mask[:, None].to(particles.means)
 
     def later_values(self, name: str, newest: Tensor, predicted: Tensor, share: Tensor) -> Tensor:
-        """Values [S, N, ...] of an attribute after each step of a call.
-
-        Args:
-            name: attribute.
-            newest: newest values [N, ...].
-            predicted: network outputs [S, N, channels].
-            share: factor [N, 1] of the predicted change; 0 keeps the value with equal bits.
-        """
+        """Values [S, N, ...] of an attribute after each step of a call, from the ``newest`` ones [N, ...] and network
+        outputs [S, N, channels]; ``share``: factor [N, 1] of the predicted change, 0 keeps the bits of the value."""
         if name == "quats":
             return self._later_quats(newest, predicted, share)
         share = share.reshape(*share.shape[:-1], *(1,) * (newest.dim() - 1))

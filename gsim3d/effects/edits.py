@@ -29,7 +29,7 @@ from gsim3d.io.files import read_yaml, shown
 from gsim3d.io.settings import from_dict
 from gsim3d.math.rotations import quat_product, rotate_left, rotation_matrices
 from gsim3d.math.spherical_harmonics import painted, rotate_harmonics
-from gsim3d.state import ATTRIBUTES, FROZEN, CloudTable, Particles, newest_clouds, with_attribute, with_same_attributes
+from gsim3d.state import ATTRIBUTES, FROZEN, Particles, joined_clouds, newest_clouds, with_attribute
 
 Colors = Callable[[Particles], Tensor]  # particles -> [N, 3] colours
 
@@ -196,7 +196,7 @@ class Duplicate(Operation):
 
     def apply(self, state: Particles, colors: Colors) -> Particles:
         chosen = self.of.mask(state)
-        return _joined(state, _moved(state, chosen, self.by).select_rows(chosen))
+        return joined_clouds(state, _moved(state, chosen, self.by).select_rows(chosen))
 
 
 @dataclass(frozen=True)
@@ -222,9 +222,8 @@ class Insert(Operation):
         for field, value in given.row_fields().items():
             mine = getattr(state, field)
             if not ATTRIBUTES[field].is_optional and (mine is None or mine.shape[1:] != value.shape[1:]):
-                raise InputError(
-                    f"particles.{field} differs in shape from the state; insert particles of the same model"
-                )
+                wanted = "insert particles of the same model"
+                raise InputError(f"particles.{field} differs in shape from the state; {wanted}")
         given = given.select_rows(chosen).to(state.means.device)
         table = state.clouds
         newest = {table.scenes[q]: table.steps[q] for q in newest_clouds(table)}
@@ -234,13 +233,13 @@ class Insert(Operation):
             age = newest[scene] - step
             q = ages.index(age) if age in ages else None
             runs.append((0, 0) if q is None else given.clouds.row_runs([q])[0])
-        counts = CloudTable.make((b - a for a, b in runs), table.scenes, table.steps, state.cu_rows.device)
+        counts = table.with_counts(b - a for a, b in runs)
         fields = {name: torch.cat([x[a:b] for a, b in runs]) for name, x in given.row_fields().items()}
         own = {"origin": state.origin, "world_offset": state.world_offset}
         here = dataclasses.replace(given, **own).with_clouds(counts, **fields)
         there = None if given.world_offset is None else given.world_offset[given.clouds.scenes[-1]]
         by = _between(there, here.row_offset(), self.by)
-        return _joined(state, _moved(here, torch.ones_like(here.activity, dtype=torch.bool), by))
+        return joined_clouds(state, _moved(here, torch.ones_like(here.activity, dtype=torch.bool), by))
 
 
 OPERATIONS = {kind.name: kind for kind in (Remove, Move, Rotate, Throw, Recolor, Duplicate, Insert)}
@@ -376,15 +375,3 @@ def _centers(state: Particles, chosen: Tensor) -> Tensor:
     one = F.one_hot(scene, int(scene.max()) + 1).to(state.means)
     sums = (one * chosen[:, None]).mT @ torch.cat([state.means, torch.ones_like(state.means[:, :1])], 1)
     return (sums[:, :3] / sums[:, 3:].clamp(min=1))[scene]
-
-
-def _joined(state: Particles, more: Particles) -> Particles:
-    """Appends the particles of each cloud of ``more`` to the same cloud of ``state``."""
-    parts = with_same_attributes([state, more])
-    clouds = torch.cat([part.row_cloud() for part in parts])
-    order = torch.argsort(clouds, stable=True)
-    fields = {name: torch.cat([value, getattr(parts[1], name)])[order] for name, value in parts[0].row_fields().items()}
-    tables = [part.clouds for part in parts]
-    counts = map(sum, zip(*(table.counts for table in tables)))
-    table = CloudTable.make(counts, tables[0].scenes, tables[0].steps, state.cu_rows.device)
-    return state.with_clouds(table, **fields)

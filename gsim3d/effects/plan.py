@@ -223,14 +223,8 @@ def _block(config: DynamicsConfig, particles: float, context: float, channels: i
 
 
 def by_plan(particles: Particles, plans: Sequence[Plan]) -> Iterator[tuple[Plan, list[int]]]:
-    """Groups scenes by plan: yields each different plan with the clouds of its scenes.
-
-    Args:
-        particles: particles of several scenes.
-        plans: one plan for each scene.
-    Raises:
-        InputError: the number of plans differs from that of scenes.
-    """
+    """Groups scenes by plan: yields each different plan with the clouds of its scenes. Raises InputError if the number
+    of ``plans`` differs from that of scenes."""
     n_scenes = particles.origin.shape[0]
     if len(plans) != n_scenes:
         raise InputError(f"plans: there must be one for each of {n_scenes} scenes; got {len(plans)}")

@@ -12,7 +12,7 @@ from gsim3d.effects.spec import EffectsSpec, OutputEffects
 from gsim3d.errors import InputError
 from gsim3d.io.settings import from_dict
 from gsim3d.io.terminal import in_columns
-from gsim3d.numerics.speed import SPEEDS_FILE, read_speeds
+from gsim3d.numerics.speed import SPEEDS_FILE, read_checkpoints
 from gsim3d.presets import ModelConfig
 from gsim3d.simulator import Simulator
 from gsim3d.train.config import DataConfig
@@ -50,7 +50,7 @@ class PartTimes:
 
 def load_times(folder: Path, restored: Restored) -> dict[str, PartTimes]:
     """Reads device -> measured times of a checkpoint's reference step; empty if it was not profiled."""
-    devices, where = read_speeds(folder).get(restored.checkpoint.digest) or {}, folder / SPEEDS_FILE
+    devices = read_checkpoints(where := folder / SPEEDS_FILE).get(restored.checkpoint.digest) or {}
     known = {name: kept[TIMES] for name, kept in devices.items() if isinstance(kept, dict) and TIMES in kept}
     return {name: from_dict(PartTimes, values, f"{where}: {name}: {TIMES}: ") for name, values in known.items()}
 

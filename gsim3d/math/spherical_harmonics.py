@@ -68,8 +68,6 @@ def rotate_harmonics(sh: Tensor, rotations: Tensor) -> Tensor:
     Args:
         sh: [N, K, C], K = 1, 4, 9 or 16.
         rotations: [N, 3, 3].
-    Returns:
-        [N, K, C].
     """
     degree = math.isqrt(sh.shape[1]) - 1
     turned = [sh[:, :1]]
@@ -93,14 +91,10 @@ def _reading(level: int, dtype: torch.dtype, device: torch.device) -> tuple[Tens
         return directions.to(device, dtype), read.to(device, dtype)
 
 
+@functools.lru_cache(maxsize=64)
 def readings(dtype: torch.dtype, device: torch.device) -> Tensor:
     """[128]: of degrees 1 to 3 the directions, then what turns values into coefficients; for
     :func:`gsim3d.ops.decode_gaussians`."""
-    return _readings(dtype, device)
-
-
-@functools.lru_cache(maxsize=64)
-def _readings(dtype: torch.dtype, device: torch.device) -> Tensor:
     with torch.inference_mode(False):
         parts = [part.flatten() for level in range(1, MAX_DEGREE + 1) for part in _reading(level, dtype, device)]
         return torch.cat(parts)

@@ -48,13 +48,9 @@ class Fusion(nn.Module):
 
 
 class DPTHead(nn.Module):
-    """Tokens [I, 4, h w, C] -> [I, n_out, H, W].
+    """Tokens [I, 4, h w, C] of a backbone -> [I, n_out, H, W].
 
     Heads of backbones whose views mix also normalise the tokens and read where in the image a pixel lies.
-
-    Args:
-        config: of the backbone.
-        n_out: channels of the output.
     """
 
     def __init__(self, config: Architecture, n_out: int):
@@ -62,14 +58,8 @@ class DPTHead(nn.Module):
         dim, channels, self.is_placed = config.head_dim, config.head_channels, config.mixes_from is not None
         self.norm = nn.LayerNorm(config.token_dim) if self.is_placed else nn.Identity()
         self.projects = nn.ModuleList(nn.Conv2d(config.token_dim, c, 1) for c in channels)
-        self.resize_layers = nn.ModuleList(
-            [
-                nn.ConvTranspose2d(channels[0], channels[0], 4, 4),
-                nn.ConvTranspose2d(channels[1], channels[1], 2, 2),
-                nn.Identity(),
-                nn.Conv2d(channels[3], channels[3], 3, 2, 1),
-            ]
-        )
+        larger = (nn.ConvTranspose2d(c, c, n, n) for c, n in zip(channels, (4, 2)))
+        self.resize_layers = nn.ModuleList([*larger, nn.Identity(), nn.Conv2d(channels[3], channels[3], 3, 2, 1)])
         last = nn.Conv2d(LAST_DIM, n_out, 1)
         nn.init.normal_(last.weight, std=INITIAL_OUTPUT / LAST_DIM**0.5)
         nn.init.zeros_(last.bias)
@@ -84,10 +74,8 @@ class DPTHead(nn.Module):
 
     def forward(self, tokens: Tensor, grid: tuple[int, int], size: tuple[int, int]) -> Tensor:
         """grid: (h, w) of the patches; size: (H, W) of the result."""
-        maps = []
-        for i, (x, project, layer) in enumerate(
-            zip(self.norm(tokens).unbind(1), self.projects, self.resize_layers, strict=True), 1
-        ):
+        maps, levels = [], zip(self.norm(tokens).unbind(1), self.projects, self.resize_layers, strict=True)
+        for i, (x, project, layer) in enumerate(levels, 1):
             x = self._placed(project(x.mT.unflatten(-1, grid)), size)
             maps.append(self.scratch[f"layer{i}_rn"](layer(x)))
         sizes = [tuple(finer.shape[2:]) for finer in maps[:3]]

@@ -8,6 +8,7 @@ written out below, for a backward pass in as few launches.
 from __future__ import annotations
 
 import functools
+from collections import namedtuple
 from typing import NamedTuple
 
 import torch
@@ -20,9 +21,8 @@ from gsim3d.ops.curve import PatchTable, Stage
 from gsim3d.ops.streams import Streams
 
 _ops = torch.ops.gsim3d
-_autocast = torch._C.DispatchKeySet(torch._C.DispatchKey.AutocastCUDA) | torch._C.DispatchKeySet(
-    torch._C.DispatchKey.AutocastCPU
-)
+_keys = torch._C.DispatchKey.AutocastCUDA, torch._C.DispatchKey.AutocastCPU
+_autocast = torch._C.DispatchKeySet(_keys[0]) | torch._C.DispatchKeySet(_keys[1])
 
 
 class BlockInputs(NamedTuple):
@@ -38,15 +38,8 @@ class BlockInputs(NamedTuple):
 
     def geometry(self) -> tuple:
         voxels, taps = self.stage.voxels, self.stage.kernel_maps[self.kernel_size]
-        return (
-            voxels.row_voxel,
-            voxels.rows,
-            voxels.cu_rows,
-            taps.tap_in,
-            taps.tap_out,
-            taps.cu_taps,
-            self.reads_lowest,
-        )
+        pairs = taps.tap_in, taps.tap_out, taps.cu_taps
+        return voxels.row_voxel, voxels.rows, voxels.cu_rows, *pairs, self.reads_lowest
 
     def conv_plan(self) -> Tensor | None:
         return self.stage.kernel_maps[self.kernel_size].plan
@@ -55,47 +48,17 @@ class BlockInputs(NamedTuple):
         return self.patches.q_rows, self.patches.kv_rows, self.patches.cu_q, self.patches.cu_k
 
 
-class Weights(NamedTuple):
-    conv: Tensor
-    conv_bias: Tensor
-    linear: Tensor
-    linear_bias: Tensor
-    qkv: Tensor
-    qkv_bias: Tensor
-    proj: Tensor
-    proj_bias: Tensor
-    fc1: Tensor
-    fc1_bias: Tensor
-    fc2: Tensor
-    fc2_bias: Tensor
-    position_norm: Tensor
-    position_norm_bias: Tensor
-    norm1: Tensor
-    norm1_bias: Tensor
-    norm2: Tensor
-    norm2_bias: Tensor
-
-
-N_ROUNDED = 12  # of the weights are read in the dtype of the products
-
-
-class Saved(NamedTuple):
-    """What the backward pass reads."""
-
-    place: Tensor  # of the convolution
-    position: Tensor  # of the linear layer behind it
-    sum1: Tensor
-    normed1: Tensor
-    position_stats: Tensor
-    stats1: Tensor
-    qkv: Tensor
-    attended: Tensor
-    attention_stats: Tensor
-    sum2: Tensor
-    normed2: Tensor
-    stats2: Tensor
-    hidden: Tensor
-    activated: Tensor
+Weights = namedtuple(
+    "Weights",
+    "conv conv_bias linear linear_bias qkv qkv_bias proj proj_bias fc1 fc1_bias fc2 fc2_bias position_norm "
+    "position_norm_bias norm1 norm1_bias norm2 norm2_bias",
+)
+# What the backward pass reads: results of the convolution, of the linear layer behind it, and of what follows.
+Saved = namedtuple(
+    "Saved",
+    "place position sum1 normed1 position_stats stats1 qkv attended attention_stats sum2 normed2 stats2 hidden "
+    "activated",
+)
 
 
 def run_block(block, x: Tensor, conv_input: Tensor, stage: Stage, row: int, keeps: list, recompute: bool, beside=None):
@@ -163,17 +126,7 @@ def _heads(qkv: Tensor, heads: int) -> tuple[Tensor, ...]:
     return qkv.view(qkv.shape[0], 3, heads, qkv.shape[1] // (3 * heads)).unbind(1)
 
 
-def _backward(
-    plan: BlockInputs,
-    w: Weights,
-    kept: Saved,
-    conv_input: Tensor,
-    keep_attention,
-    keep_mlp,
-    grad_sum,
-    grad_out,
-    streams,
-):
+def _backward(plan, w: Weights, kept: Saved, conv_input: Tensor, keep_attention, keep_mlp, grad_sum, grad_out, streams):
     """Gradients of x, conv_input and all weights, in their order; those of weights of layers run in ``streams``."""
     # Without a norm of the branch the op reads only the dtype of the branch: any tensor like it will do.
     grad2, grad_branch, fc2_bias, *_ = _ops.residual_norm_backward.default(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -14,15 +14,8 @@ from gsim3d import ops
 from gsim3d.cameras import Cameras
 from gsim3d.errors import InputError, check_ranges
 from gsim3d.math.rotations import quat_product, rotation_matrices
-from gsim3d.math.spherical_harmonics import (
-    lit,
-    painted,
-    readings,
-    rotate_harmonics,
-)
+from gsim3d.math.spherical_harmonics import lit, painted, readings, rotate_harmonics
 from gsim3d.nn.layers import RowLinear
-from gsim3d.numerics.policy import OnInvalid
-from gsim3d.numerics.report import StabilityReport
 from gsim3d.ops.raster import Rendering
 from gsim3d.state import Gaussians, Particles
 
@@ -100,23 +93,16 @@ class GaussianHead(nn.Module):
             wanted = [(c * K, c * K + n_harmonics) for c in range(3)] if n_harmonics else []
             raw = self.fc2.some(hidden, [*wanted, (3 * K, 3 * K + 7)])
         sh, quats, scales = self._decoded(raw, particles.orientations, n_harmonics)
-        return (
-            sh if sh is None or particles.color_transform is None else painted(sh, particles.color_transform),
-            quats,
-            scales,
-        )
+        if sh is not None and particles.color_transform is not None:
+            sh = painted(sh, particles.color_transform)
+        return sh, quats, scales
 
     def _decoded(self, raw: Tensor, turns: Tensor | None, n_harmonics: int) -> tuple[Tensor | None, Tensor, Tensor]:
         """Harmonics, unit quaternions and scales of the channels ``raw``, turned further by ``turns``."""
-        wide = torch.float64 if raw.dtype == torch.float64 else torch.float32
-        quats, scales, sh = ops.decode_gaussians(
-            raw,
-            readings(wide, raw.device),
-            degree=math.isqrt(n_harmonics) - 1,
-            scale_min=self.config.scale_min,
-            scale_max=self.config.scale_max,
-            check=False,
-        )
+        table = readings(torch.float64 if raw.dtype == torch.float64 else torch.float32, raw.device)
+        limits = {"scale_min": self.config.scale_min, "scale_max": self.config.scale_max}
+        degree = math.isqrt(n_harmonics) - 1
+        quats, scales, sh = ops.decode_gaussians(raw, table, degree=degree, **limits, check=False)
         if turns is not None:
             quats = quat_product(turns, quats)
         if n_harmonics == 0:
@@ -126,38 +112,12 @@ class GaussianHead(nn.Module):
         return sh, quats, scales
 
 
-def render(
-    gaussians: Gaussians,
-    cameras: Cameras,
-    background: Tensor | None = None,
-    *,
-    near_plane: float = NEAR_PLANE,
-    features: Tensor | None = None,
-    active: Tensor | None = None,
-    cutoff: str = "exact",
-    jacobian: str = "exact",
-    on_invalid: OnInvalid = "raise",
-    report: StabilityReport | None = None,
-) -> Rendering:
+def render(gaussians: Gaussians, cameras: Cameras, background: Tensor | None = None, **options: Any) -> Rendering:
     """Images of ``cameras``; camera i shows cloud ``cameras.image_cloud[i]`` of ``gaussians``.
 
     Arguments and errors as :func:`gsim3d.ops.rasterize_gaussians`. The colours of Gaussians without any mean nothing.
     """
-    color = {"colors": gaussians.means} if gaussians.sh is None else {"sh": gaussians.sh}
-    return ops.rasterize_gaussians(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        cameras,
-        **color,
-        features=features,
-        background=background,
-        cu_rows=gaussians.cu_rows,
-        active=active,
-        near_plane=near_plane,
-        cutoff=cutoff,
-        jacobian=jacobian,
-        on_invalid=on_invalid,
-        report=report,
-    )
+    rows = gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities
+    options = {"near_plane": NEAR_PLANE, **options}
+    options |= {"colors": gaussians.means} if gaussians.sh is None else {"sh": gaussians.sh}
+    return ops.rasterize_gaussians(*rows, cameras, background=background, cu_rows=gaussians.cu_rows, **options)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -19,19 +19,9 @@ from torch.utils.checkpoint import checkpoint
 
 from gsim3d import ops
 from gsim3d.errors import check_ranges
+from gsim3d.nn import layers
 from gsim3d.nn.fused_block import run_block
-from gsim3d.nn.layers import (
-    RowLayerNorm,
-    RowLinear,
-    make_norm,
-    product_dtype,
-    round_weights,
-    rounded_linear,
-    rounded_weights,
-    row_linear,
-    use_rounded,
-    widened,
-)
+from gsim3d.nn.layers import RowLayerNorm, RowLinear, make_norm, product_dtype, rounded_weights, row_linear, widened
 from gsim3d.ops.curve import PatchTable, Pyramid, PyramidSpec, Stage
 from gsim3d.ops.streams import Streams
 
@@ -78,6 +68,9 @@ class TransformerConfig:
     drop_path: float = 0.3
     checkpointing: bool = False
 
+    origin_of_scene: ClassVar[bool] = True  # cells are counted from the origin of a scene: scenes are independent
+    slots_from_newest: ClassVar[bool] = True  # steps are counted back from the newest, in histories of any length
+
     def __post_init__(self):
         name, n = type(self).__name__, self.n_stages
         sizes = {
@@ -110,27 +103,11 @@ class TransformerConfig:
         """Channels of a particle behind the decoder."""
         return (*self.decoder_channels, self.encoder_channels[-1])[0]
 
-    @property
-    def origin_of_scene(self) -> bool:
-        """Whether cells are counted from the origin of a scene, so that scenes do not see each other."""
-        return True
-
-    @property
-    def slots_from_newest(self) -> bool:
-        """Whether steps are counted back from the newest, so that it has one place in histories of any length."""
-        return True
-
     def pyramid_spec(self, history_bits: int) -> PyramidSpec:
         """What the geometry op needs to know, for a history of up to 2^history_bits steps."""
-        return PyramidSpec(
-            grid_size=self.grid_size,
-            slot_bits=history_bits,
-            strides=tuple(self.strides),
-            merge_windows=tuple(self.merge_windows),
-            patch_sizes=tuple(self.patch_sizes),
-            kernel_sizes=((STEM_KERNEL, BLOCK_KERNEL),) + ((BLOCK_KERNEL,),) * (self.n_stages - 1),
-            release=not self.origin_of_scene,
-        )
+        kernel_sizes = ((STEM_KERNEL, BLOCK_KERNEL),) + ((BLOCK_KERNEL,),) * (self.n_stages - 1)
+        levels = tuple(self.strides), tuple(self.merge_windows), tuple(self.patch_sizes), kernel_sizes
+        return PyramidSpec(self.grid_size, history_bits, *levels, release=not self.origin_of_scene)
 
 
 class FrozenContext(Protocol):
@@ -492,7 +469,7 @@ class Head(nn.Module):
             weight, bias = (torch.cat([getattr(part, name) for part in parts]) for name in ("weight", "bias"))
             if outputs is not None:
                 weight, bias = (torch.cat([t[a:b] for a, b in outputs]) for t in (weight, bias))
-            return rounded_linear(x, weight, bias)
+            return layers.rounded_linear(x, weight, bias)
         return self.fc2(x) if outputs is None else self.fc2.some(x, outputs)
 
 
@@ -532,9 +509,9 @@ class PointTransformer(nn.Module):
             x = self.stem(x, pyramid.stages[0], contexts[0])
             return self._behind_stem(x, pyramid, generator, contexts)
         with Streams(x) as streams:
-            rounded = streams.run(round_weights, self._products, product_dtype(x))
+            rounded = streams.run(layers.round_weights, self._products, product_dtype(x))
             x = self.stem(x, pyramid.stages[0], contexts[0])
-        with use_rounded(rounded):
+        with layers.use_rounded(rounded):
             return self._behind_stem(x, pyramid, generator, contexts)
 
     def _behind_stem(

@@ -81,9 +81,8 @@ class PointTransformerV3Config:
         """The same sizes for the layers that it shares with the project's own network."""
         shared = {field.name for field in dataclasses.fields(TransformerConfig)}
         own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name in shared}
-        return TransformerConfig(
-            grid_size=1.0, history_bits=0, merge_windows=(1,) * len(self.strides), time_embedding=False, **own
-        )
+        without_time = {"history_bits": 0, "merge_windows": (1,) * len(self.strides), "time_embedding": False}
+        return TransformerConfig(grid_size=1.0, **without_time, **own)
 
     def pyramid_spec(self) -> PyramidSpec:
         """The geometry of the network; an edge of a cell is 1."""
@@ -235,11 +234,9 @@ class PointTransformerV3(nn.Module):
         own, names = self.state_dict(), {pointcept_name(name): name for name in self.state_dict()}
         problems = [f"missing: {key}" for key in names.keys() - state.keys()]
         problems += [f"unknown: {key}" for key in state.keys() - names.keys()]
-        problems += [
-            f"{key} must be {list(own[names[key]].shape)}; got {list(value.shape)}"
-            for key, value in state.items()
-            if key in names and value.shape != own[names[key]].shape
-        ]
+        for key, value in state.items():
+            if key in names and value.shape != (shape := own[names[key]].shape):
+                problems.append(f"{key} must be {list(shape)}; got {list(value.shape)}")
         if problems:
             shown = "; ".join(sorted(problems)[:5])
             raise InputError(f"load_pointcept: {len(problems)} keys do not fit the configuration: {shown}")
@@ -258,14 +255,9 @@ OTHER_NETWORKS = {  # tell-tale keys
     "the temporal network of 3DGSim (gsim3d import reads it)": r"dynamic_model\.net\.|\.merger\.",
 }
 OF_BLOCK = {
-    "position.conv": "cpe.0",
-    "position.linear": "cpe.1",
-    "position.norm": "cpe.2",
-    "norm1": "norm1.0",
-    "attention": "attn",
-    "norm2": "norm2.0",
-    "mlp": "mlp.0",
-}
+    "position.conv": "cpe.0", "position.linear": "cpe.1", "position.norm": "cpe.2",
+    "norm1": "norm1.0", "attention": "attn", "norm2": "norm2.0", "mlp": "mlp.0",
+}  # fmt: skip
 OF_UNPOOL = {"proj": "proj.0", "proj_norm": "proj.1", "skip": "proj_skip.0", "skip_norm": "proj_skip.1"}
 
 

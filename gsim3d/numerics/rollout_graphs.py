@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from gsim3d.cuda_graphs import CapturedRollout, gaps_of
+from gsim3d.cuda_graphs import CapturedRollout, gaps_of, kind_of
 from gsim3d.effects.plan import Plan
 from gsim3d.errors import CaptureError
 from gsim3d.numerics.report import StabilityReport
@@ -39,13 +39,7 @@ class RolloutGraphs:
         return RolloutGraphs, ()
 
     def replayed(
-        self,
-        simulator: Any,
-        state: Particles,
-        n_steps: int,
-        plan: Plan,
-        report: StabilityReport,
-        given: dict[str, Any],
+        self, simulator: Any, state: Particles, n_steps: int, plan: Plan, report: StabilityReport, given: dict[str, Any]
     ) -> list[Particles] | None:
         """Returns the steps from a graph, or None where the rollout has to run step by step.
 
@@ -100,7 +94,7 @@ def _obstacle(simulator: Any, state: Particles, n_steps: int, plan: Plan, given:
 
 def _kind_of(simulator: Any, state: Particles, plan: Plan) -> tuple:
     """Returns what a graph fixes of a state and of the surroundings of a call."""
-    table, device, actions = state.clouds, state.means.device, state.actions
+    table, device = state.clouds, state.means.device
     moving: list[int] = []
     if simulator.config.dynamics.is_asymmetric or plan.spec.dynamics.background == "masked_out":
         clouds = zip(table.starts, table.starts[1:])
@@ -108,7 +102,7 @@ def _kind_of(simulator: Any, state: Particles, plan: Plan) -> tuple:
     return (
         (table.starts, table.scenes, gaps_of(table), moving),
         [(name, value.shape[1:], value.dtype) for name, value in state.row_fields().items()],
-        (device, None if actions is None else (actions.positions.shape, actions.names)),
+        (device, kind_of(state.actions)),
         torch.get_autocast_dtype(device.type) if torch.is_autocast_enabled(device.type) else None,
         torch.is_inference_mode_enabled(),
     )

@@ -28,7 +28,7 @@ PRECISIONS = ("fp32", "tf32", "bf16", "fp16")
 DTYPES = {"bf16": torch.bfloat16, "fp16": torch.float16}
 PARTS = ("encoder", "dynamics", "renderer")
 SPEEDS = ("exact", "balanced", "fast")
-SPEEDS_FILE = "speeds.json"  # {digest of a checkpoint: {device type: {speed: setting}}}
+SPEEDS_FILE = "speeds.json"  # {digest of a checkpoint: {device type: {speed: setting}}}; see read_checkpoints
 
 
 @dataclass(frozen=True)
@@ -129,13 +129,9 @@ class Setting:
         sleep = spec.dynamics.sleep
         if self.sleep is not None:
             sleep = Sleep(policy="approx" if is_asymmetric else "exact", eps=self.sleep)
-        dynamics = dataclasses.replace(
-            spec.dynamics,
-            history=self.history or spec.dynamics.history,
-            background=self.background or spec.dynamics.background,
-            sleep=None if self.captured else sleep,
-        )
-        appearance = spec.appearance
+        appearance, dynamics = spec.appearance, spec.dynamics
+        given = {name: getattr(self, name) or getattr(dynamics, name) for name in ("history", "background")}
+        dynamics = dataclasses.replace(dynamics, **given, sleep=None if self.captured else sleep)
         if self.sh_degree is not None:
             appearance = dataclasses.replace(appearance, view_dependent=self.sh_degree)
         return dataclasses.replace(spec, dynamics=dynamics, appearance=appearance)
@@ -168,17 +164,8 @@ def encode(simulator: Any, source: Frames | FrameSource, names: Sequence[str] = 
 def encode_histories(
     simulator: Any, source: Frames | FrameSource, names: Sequence[str] = (), left_out: int = MOST_LEFT_OUT
 ) -> list[Particles]:
-    """Encodes frames, also without their 1 to ``left_out`` oldest steps, and warns as :func:`check_input` does.
-
-    Args:
-        simulator: a :class:`gsim3d.Simulator`.
-        source: see :meth:`gsim3d.Simulator.predict`.
-        names: names of the scenes in warnings.
-        left_out: largest number of steps to leave out.
-
-    Raises:
-        InputError: the image size is wrong.
-    """
+    """Encodes frames, also without their 1 to ``left_out`` oldest steps, and warns as :func:`check_input` does, with
+    ``names`` of the scenes. Raises InputError if the image size is wrong."""
     inputs = InputSpec() if simulator.inputs is None else simulator.inputs
     frames = source if isinstance(source, Frames) else source.input_frames(inputs)
     size = (frames.cameras.width, frames.cameras.height)
@@ -230,36 +217,17 @@ def draw(
         return simulator._draw(particles, cameras, background, plan, cutoff=setting.cutoff)
 
 
-def read_speeds(folder: Path) -> dict[str, Any]:
-    """Reads the tuned settings of ``folder``: {digest: {device type: {speed: setting}}}, empty without a file.
-
-    Raises:
-        InputError: the file is invalid.
-    """
-    return read_checkpoints(folder / SPEEDS_FILE)
-
-
 def load_speed(folder: Path, digest: str | None, device: str, speed: str) -> Setting:
-    """Reads the tuned setting of a checkpoint for a device.
-
-    Args:
-        folder: folder of the checkpoint.
-        digest: digest of the checkpoint.
-        device: "cpu" or "cuda".
-        speed: one of SPEEDS.
-    Raises:
-        InputError: the checkpoint is not tuned for this device.
-    """
+    """Reads the tuned setting of the checkpoint in ``folder`` for a device, "cpu" or "cuda", and one of SPEEDS. Raises
+    InputError if the checkpoint is not tuned for this device."""
     if speed not in SPEEDS:
         raise InputError(f"speed: must be one of {', '.join(SPEEDS)}; got {speed!r}{did_you_mean(speed, SPEEDS)}")
     if speed == "exact":
         return Setting()
-    found = read_speeds(folder)
+    found = read_checkpoints(folder / SPEEDS_FILE)
     for key in (digest, device, speed):
         found = found.get(key)
         if not isinstance(found, dict):
-            raise InputError(
-                f"speed {speed}: this checkpoint is not tuned for {device} (in {folder / SPEEDS_FILE}); run "
-                "gsim3d profile CHECKPOINT first"
-            )
+            lacks = f"this checkpoint is not tuned for {device} (in {folder / SPEEDS_FILE})"
+            raise InputError(f"speed {speed}: {lacks}; run gsim3d profile CHECKPOINT first")
     return Setting.from_dict(found)

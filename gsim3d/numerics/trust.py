@@ -97,10 +97,8 @@ class Trust:
         """
         if level not in self.levels:
             raise InputError(f"trust: level must be one of {', '.join(map(str, self.levels))}; got {level}")
-        scores, bounds = (
-            torch.tensor(values, dtype=torch.float64, device=spread.device)
-            for values in (self.scores, self.bounds[self.levels.index(level)])
-        )
+        table = torch.tensor([self.scores, self.bounds[self.levels.index(level)]], dtype=torch.float64)
+        scores, bounds = table.to(spread.device)
         score = self.score(spread, first).clamp(scores[0], scores[-1])
         above = torch.searchsorted(scores, score).clamp(min(1, len(scores) - 1), len(scores) - 1)
         width = (scores[above] - scores[above - 1]).clamp(min=1e-12)
@@ -139,19 +137,14 @@ class Trust:
 def trust_of(simulator: Any, checkpoint: str | Path) -> Trust:
     """Returns the calibration of a simulator. Raises InputError with the command that makes one if there is none."""
     if simulator.trust is None:
-        raise InputError(
-            f"{checkpoint}: errors are not calibrated, or not at this --speed; calibrate them on generated scenes: "
-            f"gsim3d evaluate {checkpoint} DATA --scenes all --calibrate-trust"
-        )
+        command = f"gsim3d evaluate {checkpoint} DATA --scenes all --calibrate-trust"
+        lacks = f"{checkpoint}: errors are not calibrated, or not at this --speed"
+        raise InputError(f"{lacks}; calibrate them on generated scenes: {command}")
     return simulator.trust
 
 
 def load_trust(folder: Path, digest: str | None) -> Trust | None:
-    """Reads the calibration of a checkpoint in ``folder``; None if there is none.
-
-    Raises:
-        InputError: the file is invalid.
-    """
+    """Reads the calibration of a checkpoint in ``folder``; None if there is none. Raises InputError if it is wrong."""
     found = read_checkpoints(folder / TRUST_FILE).get(digest)
     return None if found is None else from_dict(Trust, found, f"{folder / TRUST_FILE}: ")
 
@@ -174,32 +167,25 @@ def without_oldest(frames: Frames, n_steps: int) -> Frames:
     if n_steps == 0:
         return frames
     scenes = frames.cloud_scene.tolist()
-    kept = [
-        cloud
-        for scene in dict.fromkeys(scenes)
-        for own in [[cloud for cloud, other in enumerate(scenes) if other == scene]]
-        for cloud in own[max(0, min(n_steps, len(own) - 2)) :]
-    ]
+    kept = []
+    for scene in dict.fromkeys(scenes):
+        own = [cloud for cloud, other in enumerate(scenes) if other == scene]
+        kept += own[max(0, min(n_steps, len(own) - 2)) :]
     device, cameras = frames.images.device, frames.cameras
     number = torch.full((len(scenes),), -1, device=device)
     number[kept] = torch.arange(len(kept), device=device)
     images = (number[cameras.image_cloud] >= 0).nonzero()[:, 0]
-    fields = ("images", "masks", "dynamic", "valid", "backbone_features")
+    names = ("images", "masks", "dynamic", "valid", "backbone_features")
+    fields = {name: value[images] for name in names if (value := getattr(frames, name)) is not None}
+    fields["cameras"] = cameras.select(images, number[cameras.image_cloud[images]])
     return dataclasses.replace(
-        frames,
-        **{name: value[images] for name in fields if (value := getattr(frames, name)) is not None},
-        cameras=cameras.select(images, number[cameras.image_cloud[images]]),
-        cloud_scene=frames.cloud_scene[kept],
-        cloud_step=frames.cloud_step[kept],
+        frames, **fields, cloud_scene=frames.cloud_scene[kept], cloud_step=frames.cloud_step[kept]
     )
 
 
 def variants(histories: Sequence[Particles]) -> Particles:
-    """Packs the variants of all scenes; variant k of scene b is scene ``b * len(VARIANTS) + k``.
-
-    Args:
-        histories: the state encoded from all input steps, and without the 1, 2 ... oldest ones.
-    """
+    """Packs the variants of all scenes; variant k of scene b is scene ``b * len(VARIANTS) + k``. ``histories``: the
+    state encoded from all input steps, and without the 1, 2 ... oldest ones."""
     state, count, parts = histories[0], len(VARIANTS), []
     origin, offset = (x if x is None else x.repeat_interleave(count, 0) for x in (state.origin, state.world_offset))
     actions = state.actions
@@ -267,14 +253,7 @@ def _shifted(simulator: Any, n_scenes: int, device: torch.device) -> Callable[[P
 
 @torch.no_grad()
 def draw_values(simulator: Any, particles: Particles, values: Tensor, cameras: Cameras) -> Tensor:
-    """Renders a value of each particle, such as its bound: [I, H, W], 0 where nothing is drawn.
-
-    Args:
-        simulator: a :class:`gsim3d.Simulator`.
-        particles: particles of one or more clouds.
-        values: [N].
-        cameras: cameras of I images.
-    """
+    """Renders a value of each particle, such as its bound: [I, H, W] from ``values`` [N], 0 where nothing is drawn."""
     gaussians = simulator.renderer(particles, sh_degree=0)
     fields = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities)
     colors, cu_rows = values.float()[:, None].expand(-1, 3), gaussians.cu_rows
@@ -284,12 +263,7 @@ def draw_values(simulator: Any, particles: Particles, values: Tensor, cameras: C
 @torch.no_grad()
 def input_measures(simulator: Any, frames: Frames, state: Particles) -> list[dict[str, float]]:
     """Measures the newest input step of each scene: cameras, lens, ground, size of bodies, error of re-rendering.
-
-    Args:
-        simulator: a :class:`gsim3d.Simulator`.
-        frames: input frames before subsampling.
-        state: particles encoded from them.
-    """
+    ``frames`` are not subsampled yet; ``state``: the particles encoded from them."""
     return [_measures(simulator, frames, state, cloud) for cloud in newest_clouds(state.clouds)]
 
 
@@ -336,14 +310,8 @@ def _camera_measures(cameras: Cameras) -> dict[str, Tensor]:
 
 
 def check_input(simulator: Any, frames: Frames, state: Particles, names: Sequence[str] = ()) -> None:
-    """Warns with :class:`gsim3d.errors.UnfamiliarInput` about scenes outside of the validated ranges.
-
-    Args:
-        simulator: a :class:`gsim3d.Simulator`; nothing is checked without its calibration.
-        frames: input frames before subsampling.
-        state: particles encoded from them.
-        names: name of each scene. Default: its number.
-    """
+    """Warns with :class:`gsim3d.errors.UnfamiliarInput` about scenes outside of the validated ranges, if the simulator
+    has a calibration. ``frames``, ``state``: see :func:`input_measures`; ``names``: of the scenes, default: numbers."""
     if simulator.trust is None:
         return
     for scene, measures in enumerate(input_measures(simulator, frames, state)):

@@ -26,17 +26,11 @@ _WATCHED = "gsim3d.validated"  # metadata key of autograd nodes whose gradients 
 
 
 class _Checks(NamedTuple):
-    """Bounds and finding kinds of a validation.
+    """Bounds and finding kinds of a validation."""
 
-    Attributes:
-        bounds: (lowest, highest) value of each attribute.
-        kinds: (tensor, what, action) of every finding that the kernel counts.
-        neutral: first number of the replacement of an invalid value without a previous value; the others are 0.
-    """
-
-    bounds: list[tuple[float, float]]
-    kinds: list[tuple[str, str, str]]
-    neutral: list[float]
+    bounds: list[tuple[float, float]]  # (lowest, highest) value of each attribute
+    kinds: list[tuple[str, str, str]]  # (tensor, what, action) of every finding that the kernel counts
+    neutral: list[float]  # first number of what replaces an invalid value without a previous one; the others are 0
 
 
 def _checks(names: tuple[str, ...], config: StabilityConfig, max_opacity: float) -> _Checks:
@@ -98,19 +92,12 @@ def validate_particles(
     in_kernel = not clamps and not (
         torch.is_grad_enabled() and any(value.requires_grad for value in (*fields.values(), *(before or ())))
     )
+    clouds = {name: getattr(particles, name) for name in ("cloud_scene", "origin", "activity")}
+    limits = {"grid_size": grid_size, "previous": before, "max_step": config.max_speed}
+    limits["neutral"] = checks.neutral if in_kernel else None
+    values = list(fields.values())
     validated = validate_state(
-        list(fields.values()),
-        checks.bounds,
-        particles.cu_rows,
-        cloud_scene=particles.cloud_scene,
-        origin=particles.origin,
-        activity=particles.activity,
-        grid_size=grid_size,
-        previous=before,
-        max_step=config.max_speed,
-        neutral=checks.neutral if in_kernel else None,
-        join=not on_gpu,
-        check=False,
+        values, checks.bounds, particles.cu_rows, **clouds, **limits, join=not on_gpu, check=False
     )
     if not torch.compiler.is_compiling():
         read = partial(_read, particles.clouds, where, checks, previous is not None)
@@ -159,15 +146,9 @@ _OF_SCENES = ("origin", "world_offset")  # float64 [n_scenes, 3]
 def check_particles(particles: Particles, where: str, dtype: torch.dtype, widths: dict[str, int]) -> None:
     """Checks types, shapes, offsets, indices and origins, which :func:`validate_particles` does not.
 
-    Args:
-        particles: particles to check.
-        where: name of this call in messages.
-        dtype: dtype of the network.
-        widths: attribute -> number of channels that the network reads.
-    Raises:
-        InputError: a field has a wrong type, shape, device or value.
-        NumericalError: an origin, or an attribute that steps do not validate, is not finite or too large. Not checked
-            on a GPU, where such particles fall asleep.
+    Raises InputError if a field has a wrong type, shape, device or value, for a network of ``dtype`` that reads
+    ``widths`` channels of its attributes; NumericalError if an origin, or an attribute that steps do not validate, is
+    not finite or too large, but on a GPU, where such particles fall asleep. Messages begin with ``where``.
     """
     if torch.compiler.is_compiling():
         return
@@ -211,18 +192,14 @@ def _check_actions(particles: Particles, where: str) -> None:
     fits = positions.shape == (n_scenes, *types.shape[1:], 3) and types.dim() == 3 and len(types) == n_scenes
     if not fits or {positions.device, types.device} != {device}:
         got = f"{list(positions.shape)} and {list(types.shape)} on {positions.device}"
-        raise InputError(
-            f"{where}: particles.actions must have positions [{n_scenes}, T, A, 3] and types [{n_scenes}, T, A] "
-            f"on {device}; got {got}"
-        )
+        wanted = f"positions [{n_scenes}, T, A, 3] and types [{n_scenes}, T, A] on {device}"
+        raise InputError(f"{where}: particles.actions must have {wanted}; got {got}")
 
 
 def _check_choices(particles: Particles, where: str) -> None:
     if bool((particles.activity > ASLEEP).any()):
         raise InputError(f"{where}: particles.activity must be 0 (dynamic), 1 (frozen) or 2 (asleep)")
-    unvalidated = (
-        name for name, attribute in ATTRIBUTES.items() if not attribute.validated and attribute.dtype is None
-    )
+    unvalidated = [name for name, of in ATTRIBUTES.items() if not of.validated and of.dtype is None]
     for name in (*unvalidated, *_OF_SCENES):
         value = getattr(particles, name)
         if value is None:
@@ -232,11 +209,8 @@ def _check_choices(particles: Particles, where: str) -> None:
             continue
         row, one = int(good.logical_not().nonzero()[0]), "scene" if name in _OF_SCENES else "row"
         largest = f" and at most {FARTHEST:g} m in size" if name in _OF_SCENES else ""
-        raise NumericalError(
-            f"{where}: particles.{name} must be finite{largest}; {one} {row} is not",
-            tensor=f"particles.{name}",
-            **{one: row},
-        )
+        said = f"{where}: particles.{name} must be finite{largest}; {one} {row} is not"
+        raise NumericalError(said, tensor=f"particles.{name}", **{one: row})
 
 
 def drop_particles(particles: Particles, dropped: Tensor) -> Particles:
@@ -297,14 +271,10 @@ def _validate_gradients(values: Iterable[Tensor], finding: Finding, report: Stab
 
     def check(gradients, _):
         if not report.is_closed and not all(bool(g.isfinite().all()) for g in gradients if g is not None):
-            raise NumericalError(
-                f"{finding}, {finding.action}, and gradients behind it are not finite; correct the inputs of its scene "
-                "or leave it out, or use torch.no_grad()",
-                tensor=finding.tensor,
-                scene=finding.scene,
-                step=finding.step,
-                row=finding.row,
-            )
+            said = f"{finding}, {finding.action}, and gradients behind it are not finite"
+            advice = "correct the inputs of its scene or leave it out, or use torch.no_grad()"
+            place = {name: getattr(finding, name) for name in ("tensor", "scene", "step", "row")}
+            raise NumericalError(f"{said}; {advice}", **place)
 
     nodes = [value.grad_fn for value in values if value.grad_fn is not None]
     while nodes:

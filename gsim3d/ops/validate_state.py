@@ -26,8 +26,11 @@ class PartialRecord(NamedTuple):
 
     Attributes:
         parts: what each part of the rows counted.
-        cu_rows, n_rows: of the call.
-        shape, dtype, device: of the record.
+        cu_rows: of the call.
+        n_rows: of the call.
+        shape: of the record.
+        dtype: of the record.
+        device: of the record.
     """
 
     parts: Tensor

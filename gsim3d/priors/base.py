@@ -158,12 +158,8 @@ class StepContext:
         return put_runs(values, self.runs, self.history.n_rows, fill)
 
     def share(self, attribute: str, changed: str | None = None) -> Tensor:
-        """Mask [N, 1] in the dtype of positions: 1 for particles whose ``attribute`` this step changes.
-
-        Args:
-            attribute: name of the attribute.
-            changed: replaces its entry of ``changes``.
-        """
+        """Mask [N, 1] in the dtype of positions: 1 for particles whose ``attribute`` this step changes; ``changed``
+        replaces its entry of ``changes``."""
         return self._share(self.state, attribute, changed or self.changes[attribute], self.awake)
 
 

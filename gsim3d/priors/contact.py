@@ -44,16 +44,10 @@ class ContactConfig(PriorConfig):
     min_speed: float = 1e-6
 
     RANGES = {
-        "friction": (0, 1e6),
-        "offset": (-1e6, 1e6),
-        "offset_unit": (1e-9, 1e6),
-        "radius": (1e-6, 1e6),
-        "exponent": (0, 100),
-        "min_opacity": (0, 1),
-        "iterations": (1, 100),
-        "max_scale": (1, 1e6),
+        "friction": (0, 1e6), "offset": (-1e6, 1e6), "offset_unit": (1e-9, 1e6), "radius": (1e-6, 1e6),
+        "exponent": (0, 100), "min_opacity": (0, 1), "iterations": (1, 100), "max_scale": (1, 1e6),
         "min_speed": (1e-12, 1e6),
-    }
+    }  # fmt: skip
 
 
 class Contact(Prior, config=ContactConfig):
@@ -83,15 +77,8 @@ class Contact(Prior, config=ContactConfig):
 
 
 class ContactSolver:
-    """Projects displacements of the newest particles so that they do not enter the background.
-
-    Args:
-        ctx: context of the step.
-        geometry: background near the movable particles.
-        config: configuration of :class:`Contact`.
-        friction: Coulomb coefficient [], differentiable.
-        offset: contact offset [] in metres, differentiable.
-    """
+    """Projects displacements of the newest particles so that they do not enter the background. ``friction`` [] and
+    ``offset`` [] in metres are differentiable."""
 
     def __init__(
         self, ctx: StepContext, geometry: ContactGeometry, config: ContactConfig, friction: Tensor, offset: Tensor
@@ -111,11 +98,8 @@ class ContactSolver:
         self._near = geometry.proximity**power * (1 - power / geometry.range**2 * height * raised)
 
     def displacements(self, inertial: Tensor, gained: Tensor, elastic: Tensor) -> Tensor:
-        """Displacements [N, 3] in metres after the contact response.
-
-        Gradients:
-            To all three terms, friction, offset, and positions by way of height and proximity.
-        """
+        """Displacements [N, 3] in metres after the contact response. Gradients flow to all three terms, friction,
+        offset, and positions by way of height and proximity."""
         with torch.autocast(inertial.device.type, enabled=False):
             internal = (1 - self._near) * gained + elastic
             moves = inertial + self._near * gained + internal - self._rigid_part(internal)

@@ -31,12 +31,9 @@ class GravityConfig(PriorConfig):
     touch: float = 0.02
 
     RANGES = {
-        "acceleration": (-1e6, 1e6),
-        "unit": (1e-9, 1e6),
-        "radius": (1e-6, 1e6),
-        "exponent": (0, 100),
+        "acceleration": (-1e6, 1e6), "unit": (1e-9, 1e6), "radius": (1e-6, 1e6), "exponent": (0, 100),
         "touch": (1e-6, 1),
-    }
+    }  # fmt: skip
 
     def __post_init__(self):
         super().__post_init__()
@@ -72,5 +69,5 @@ class Gravity(Prior, config=GravityConfig):
 
     def move(self, motion: Motion, gains: Tensor, ctx: StepContext) -> Motion:
         touch = self.touch(ctx)
-        predicted = {"gained": touch * motion.gained, "network": touch * motion.network}
-        return replace(motion, inertial=motion.inertial + self.step, **predicted)
+        inertial, gained, network = motion.inertial + self.step, touch * motion.gained, touch * motion.network
+        return replace(motion, inertial=inertial, gained=gained, network=network)

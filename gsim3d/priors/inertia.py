@@ -77,11 +77,8 @@ def _velocities(windows: Windows, own: Tensor) -> Tensor:
 
 
 def _rigid_motion(windows: Windows, moved: Tensor, since: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """Fits a rigid motion to displacements ``moved`` [N, 3] that start, or ``since`` then end, at the positions.
-
-    Returns:
-        Displacement, spin (rad) and center of each window, [B, G, 3] each.
-    """
+    """Fits a rigid motion to displacements ``moved`` [N, 3] that start, or ``since`` then end, at the positions:
+    displacement, spin (rad) and center of each window, [B, G, 3] each."""
     samples, half = windows.movable.samples, -0.5 if since else 0.5
     paths = samples.take(windows.movable.gather(moved))
     body = RigidFit(windows.weights, samples.positions + half * paths, windows.radius)

@@ -13,18 +13,10 @@ from torch.nn import functional as F
 
 from gsim3d.cameras import Frames
 from gsim3d.errors import InputError
+from gsim3d.priors import padding
 from gsim3d.priors.base import Prior, PriorConfig, StepContext, bounded, hold
 from gsim3d.priors.movable import Movable
-from gsim3d.priors.padding import (
-    LEAST_LOGIT,
-    Compact,
-    Samples,
-    block_by_block,
-    from_blocks,
-    gaussian,
-    in_blocks,
-    squared_distances,
-)
+from gsim3d.priors.padding import LEAST_LOGIT, Compact, Samples, from_blocks, in_blocks, squared_distances
 from gsim3d.priors.rigid import SMALLEST, fit_planes
 from gsim3d.state import DYNAMIC, FROZEN, Particles
 
@@ -64,13 +56,9 @@ class DirectionalLightConfig(PriorConfig):
     max_gain: float = 2.0
 
     RANGES = {
-        "directions": (-1e6, 1e6),
-        "strength": (0, 1e6),
-        "unit": (1e-6, 1e6),
-        "beam": (1e-3, 1e3),
-        "min_opacity": (0, 1),
-        "max_gain": (0, 100),
-    }
+        "directions": (-1e6, 1e6), "strength": (0, 1e6), "unit": (1e-6, 1e6), "beam": (1e-3, 1e3),
+        "min_opacity": (0, 1), "max_gain": (0, 100),
+    }  # fmt: skip
 
     def __post_init__(self):
         super().__post_init__()
@@ -192,10 +180,8 @@ class LambertianLight(_Light):
 
     def log_gain(self, occlusion: Tensor) -> Tensor:
         n = len(self.directions)
-        now, before = (
-            ((lit[:, :, None] * self.strength.clamp(min=0)).sum(1).log1p())
-            for lit in (occlusion[:, -n:], occlusion[:, :n])
-        )
+        lit = occlusion[:, -n:], occlusion[:, :n]
+        now, before = ((x[:, :, None] * self.strength.clamp(min=0)).sum(1).log1p() for x in lit)
         return now - before
 
     def _gain(self, ctx: StepContext, log_gain: Tensor, predicted: Tensor | None) -> Tensor:
@@ -230,18 +216,8 @@ def _lit_particles(movable: Movable) -> tuple[Tensor, Tensor, Tensor]:
 def particles_between(
     positions: Tensor, samples: Samples, light: Tensor, beam: float, nearest: float, edge: float
 ) -> Tensor:
-    """Number of samples [B, M] between each position and the light.
-
-    Args:
-        positions: [B, M, 3] in metres.
-        samples: particles that cast shadows.
-        light: direction [3] towards the light, of any norm.
-        beam: standard deviation of the Gaussian beam in metres.
-        nearest: distance in metres at which samples count half.
-        edge: width in metres of the sigmoid around it.
-    Gradients:
-        To ``light``.
-    """
+    """Number of ``samples`` [B, M] between each of ``positions`` [B, M, 3] and the ``light``, a direction [3] of any
+    norm to which gradients flow: in a Gaussian ``beam``, from ``nearest`` on, with an ``edge``, all in metres."""
     direction = light / light.norm()
 
     def count(positions: Tensor, there: Tensor, known: Tensor) -> tuple[Tensor, ...]:
@@ -257,7 +233,7 @@ def particles_between(
         return counted.sum(2), by_way @ there - by_way.sum(2, keepdim=True) * positions
 
     with torch.no_grad():
-        found, *slopes = block_by_block(count, *in_blocks(positions, samples.positions, samples.known))
+        found, *slopes = padding.block_by_block(count, *in_blocks(positions, samples.positions, samples.known))
     for slope in slopes:
         found = found + slope @ (direction - direction.detach())
     return from_blocks(found, positions)
@@ -269,18 +245,11 @@ def lambert(
     """Irradiance v (n.l) and cosine n.l of each particle of the newest clouds under each light.
 
     The normal is that of a plane fit to opaque neighbours, movable or frozen as the particle, and points to the side
-    with fewer of them. A ray through ``EDGE_LAYERS`` movable surfaces loses half of its light.
+    with fewer of them. A ray through ``EDGE_LAYERS`` movable surfaces loses half of its light. Gradients flow to the
+    directions ``lights`` [L, 3] of any norm; ``facing``: n.l [N, L] of frozen particles, None: computed here.
 
-    Args:
-        movable: movable particles of the newest clouds.
-        lights: directions [L, 3] of any norm.
-        grid_size: edge of a cell in metres.
-        config: configuration of the prior.
-        facing: n.l [N, L] of frozen particles; None: computed here.
     Returns:
         Irradiance and cosine, [N, L] each, in [0, 1]; 0 for sleeping particles.
-    Gradients:
-        To ``lights``.
     """
     with torch.autocast(movable.positions.device.type, enabled=False):
         positions, is_lit, is_frozen = _lit_particles(movable)
@@ -323,7 +292,7 @@ class _Surface:
             return normal, ((blocks - wide @ around) * normal).sum(2, keepdim=True)
 
         blocks = in_blocks(kept, samples.positions, samples.known[:, None])
-        normal, out = (from_blocks(x, kept) for x in block_by_block(fit, *blocks))
+        normal, out = (from_blocks(x, kept) for x in padding.block_by_block(fit, *blocks))
         self._normal, self._out = compact.put(normal), compact.put(out)[:, :, 0]
 
     def normals(self, direction: Tensor, grid_size: float) -> Tensor:
@@ -340,6 +309,6 @@ class _Surface:
 
 def _one_layer(samples: Samples, beam: float) -> Tensor:
     """Number of samples [B, 1] that :func:`particles_between` counts for one surface: mean count around a sample."""
-    near = gaussian(squared_distances(samples.positions, samples.positions), beam)
+    near = padding.gaussian(squared_distances(samples.positions, samples.positions), beam)
     both = samples.known[:, :, None] & samples.known[:, None]
     return (torch.where(both, near, 0).sum((1, 2)) / samples.known.sum(1).clamp(min=1)).clamp(min=1)[:, None]

@@ -6,16 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from gsim3d.priors.padding import (
-    Compact,
-    PaddedClouds,
-    Samples,
-    Subset,
-    from_blocks,
-    in_blocks,
-    squared_distances,
-    weights,
-)
+from gsim3d.priors import padding
+from gsim3d.priors.padding import Compact, PaddedClouds, Samples, Subset, squared_distances
 from gsim3d.state import FROZEN, Particles, constant, newest_clouds
 
 NODES = 6  # nodes along each axis of the control grid over the movable particles of a scene
@@ -102,7 +94,7 @@ class Windows:
             logits = squared_distances(self.nodes, self._sampled) * (-0.5 / size**2)
             if evenly:
                 logits = logits - samples.density(EVEN * radius).log()[:, None]
-            self.weights = weights(logits, samples.known)
+            self.weights = padding.weights(logits, samples.known)
 
     def to_particles(self, *values: Tensor) -> tuple[Tensor, ...]:
         """Interpolates each of ``values`` [B, G, 3] to the movable particles, [B, m, 3]."""
@@ -144,7 +136,7 @@ class ControlGrid:
         Uses a matrix product, whose gradient is deterministic on a GPU; that of grid_sample is not.
         """
         at = ((positions - self._low) / self._size.clamp(min=1e-6)).clamp(0, 1)
-        at, field = in_blocks(at, torch.cat(values, 2))
+        at, field = padding.in_blocks(at, torch.cat(values, 2))
         x, y, z = (1 - (NODES - 1) * (at[..., None] - self._ticks).abs()).clamp(min=0).unbind(2)
         shares = (x[..., :, None, None] * y[..., None, :, None] * z[..., None, None, :]).flatten(2)
-        return from_blocks(shares @ field, positions).split(3, 2)
+        return padding.from_blocks(shares @ field, positions).split(3, 2)

@@ -31,9 +31,8 @@ class PaddedClouds:
 
     def __init__(self, history: Particles, chosen: list[int], grid_size: float):
         table, device = history.clouds, history.means.device
-        starts, counts, scenes = (
-            constant(tuple(of[q] for q in chosen), device) for of in (table.starts, table.counts, table.scenes)
-        )
+        columns = table.starts, table.counts, table.scenes
+        starts, counts, scenes = (constant(tuple(of[q] for q in chosen), device) for of in columns)
         index = torch.arange(max(1, max(table.count(q) for q in chosen)), device=device)
         self.rows = (starts[:, None] + index).clamp(max=history.n_rows - 1)
         self.positions = history.means.detach()[self.rows].double() - history.origin[scenes][:, None]
@@ -123,9 +122,8 @@ class Samples:
         k = torch.arange(SAMPLES, device=self.n.device)
         self.known = k < self.n[:, None]
         self._at = torch.searchsorted(self._until, self._rank(k) + 1).clamp(max=self._until.shape[1] - 1)
-        self.positions = torch.where(
-            self.known[:, :, None], subset.positions.gather(1, self._at[:, :, None].expand(-1, -1, 3)), 0
-        )
+        positions = subset.positions.gather(1, self._at[:, :, None].expand(-1, -1, 3))
+        self.positions = torch.where(self.known[:, :, None], positions, 0)
         self.mean = self.mean_of(self.positions)
 
     def _rank(self, k: Tensor) -> Tensor:

@@ -78,14 +78,9 @@ class ContactGeometry:
         self.proximity = self.features[:, -1:]
 
     def surface(self, centers: Tensor) -> tuple[Tensor, Tensor]:
-        """Local plane of the background near each particle. Normals point to the side of the body's center.
-
-        Args:
-            centers: [B, m, 3], center of the body of each movable particle, relative to ``movable.center``.
-        Returns:
-            Height over the plane in metres [N, 1] and unit normal [N, 3]; 0 for particles that cannot move and in
-            scenes without frozen particles.
-        """
+        """Local plane of the background near each particle: height over it in metres [N, 1] and unit normal [N, 3], to
+        the side of the body's center (``centers`` [B, m, 3], relative to ``movable.center``); 0 for particles that
+        cannot move and in scenes without frozen particles."""
         with torch.no_grad(), torch.autocast(self._positions.device.type, enabled=False):
             found = fit_planes(self._window, self._around, self._window_radius)
             middle, normal = (from_blocks(x, self._positions) for x in found)

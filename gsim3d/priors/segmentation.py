@@ -72,9 +72,8 @@ def segment_bodies(movable: Movable, particles: Particles, config: SegmentationC
         nearest = _nearest(squared_distances(movable.positions, samples.positions), samples.known)
         found = middle.gather(1, nearest[:, :, None].expand(-1, -1, 3)).double()
         found = found + movable.center + particles.origin[movable.scenes][:, None]
-        found, can_move = (
-            movable.scatter(x.to(particles.means.dtype)) for x in (found, torch.ones_like(found[:, :, :1]))
-        )
+        both, dtype = (found, torch.ones_like(found[:, :, :1])), particles.means.dtype
+        found, can_move = (movable.scatter(x.to(dtype)) for x in both)
         newest = particles.select_clouds(movable.newest)
         return torch.where(can_move > 0, found, with_attribute(newest, "body").body)
 

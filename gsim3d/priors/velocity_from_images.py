@@ -73,16 +73,12 @@ class VelocityFromImages(Prior, config=VelocityFromImagesConfig):
 def estimate_velocity(
     ctx: StepContext, frames: Frames, config: VelocityFromImagesConfig, fall: Tensor | None = None
 ) -> Tensor:
-    """Estimates the velocity of encoded particles, each scene on its own.
+    """Velocity [M, 3] in m/step of all particles encoded from ``frames``, each scene on its own; 0 in older clouds, and
+    in scenes with a single step.
 
-    Args:
-        ctx: context of the particles encoded from ``frames``. The i-th image of the newest step is compared with the
-            i-th image of the oldest; they should be of the same camera.
-        frames: input images. With ``ctx.n_views`` images for each cloud in order, there is no device sync.
-        config: configuration of the prior.
-        fall: acceleration [N, 3] of the newest particles in m/step^2, which converts a mean to a final velocity.
-    Returns:
-        Velocity [M, 3] in m/step of all particles; 0 in older clouds, and in scenes with a single step.
+    The i-th image of the newest step is compared with the i-th image of the oldest; they should be of the same camera.
+    With ``ctx.n_views`` images for each cloud in order, there is no device sync. ``fall``: acceleration [N, 3] of the
+    newest particles in m/step^2, which converts a mean to a final velocity.
     """
     particles, clouds, newest = ctx.history, ctx.history.clouds, ctx.newest
     result = torch.zeros_like(particles.means)
@@ -183,10 +179,8 @@ def _images(frames: Frames, n_clouds: int, n_views: int | None) -> tuple[Tensor,
 
 
 class _Views:
-    """Normalised, blurred images of movable particles, of one cloud (``chosen``) a scene.
-
-    Positions are relative to ``center`` [B, 1, 3], which is relative to the origins of the scenes.
-    """
+    """Normalised, blurred images of movable particles, of one cloud (``chosen``) a scene. Positions are relative to
+    ``center`` [B, 1, 3], which is relative to the origins of the scenes."""
 
     def __init__(
         self,

@@ -12,7 +12,7 @@ from gsim3d.errors import InputError
 from gsim3d.evaluate.plan_report import TIMES, PartTimes
 from gsim3d.evaluate.report import write_json
 from gsim3d.io.machine import machine
-from gsim3d.numerics.speed import SPEEDS_FILE, Setting, read_speeds
+from gsim3d.numerics.speed import SPEEDS_FILE, Setting, read_checkpoints
 from gsim3d.profile.settings import GROUPS, Group
 from gsim3d.profile.sweep import MAX_CACHED, PRESETS, BenchmarkCase, Effort, Point, Sweep, tie
 from gsim3d.profile.timing import GAPS
@@ -139,7 +139,7 @@ def part_times(case: BenchmarkCase, reference: Point) -> PartTimes | None:
 
 def save_speeds(folder: Path, restored: Restored, presets: dict[str, Point], times: PartTimes | None = None) -> Path:
     """Saves presets and part times of a checkpoint on its device in ``folder``/speeds.json. Returns the path."""
-    path, known = folder / SPEEDS_FILE, read_speeds(folder)
+    known = read_checkpoints(path := folder / SPEEDS_FILE)
     digest, device = restored.checkpoint.digest, restored.device.type
     settings: dict[str, Any] = {name: point.setting.to_dict() for name, point in presets.items()}
     if times is not None:

@@ -92,7 +92,7 @@ def _compiled() -> bool:
 
 
 def _ops_work(device: str) -> bool:
-    from gsim3d.ops import selftest
+    from gsim3d.testing import selftest
 
     healthy = True
     print(f"Self-test on {device} (forward and backward against plain torch)")

@@ -8,7 +8,7 @@ import torch
 from torch.nn import functional as F
 
 from gsim3d.dynamics import last_steps, rollout
-from gsim3d.priors import lighting
+from gsim3d.priors import padding
 from gsim3d.priors.lighting import SOFT, lambert
 from gsim3d.priors.movable import Movable
 from gsim3d.state import ASLEEP, DYNAMIC, FROZEN
@@ -146,8 +146,8 @@ def test_batch_equals_single_scenes_in_any_order():
 @pytest.mark.parametrize("learns", [False, True])
 def test_blocks_one_after_another_have_the_same_bits(learns, monkeypatch):
     history, found = scene(3000), []
-    for block_by_block in (lighting.block_by_block, lambda f, *blocks: f(*blocks)):
-        monkeypatch.setattr(lighting, "block_by_block", block_by_block)
+    for block_by_block in (padding.block_by_block, lambda f, *blocks: f(*blocks)):
+        monkeypatch.setattr(padding, "block_by_block", block_by_block)
         lights = SLANTED.clone().requires_grad_(learns)
         lit, facing = irradiance(history, lights, CELL)
         found.append((lit, facing, *(torch.autograd.grad(lit.sum(), [lights]) if learns else ())))

@@ -21,35 +21,18 @@ MEND = "mend its calibration or leave it out"
 
 
 class _Wanted(NamedTuple):
-    """One check of a field.
-
-    Attributes:
-        name: of the field.
-        good: bool, whether each image, cloud or scene passes.
-        what: the requirement, in words.
-        of: what the entries are: "image", "scene", or "" for entries without a scene.
-        advice: what to do.
-    """
+    """One check of a field: whether each entry passes, and the requirement in words."""
 
     name: str
     good: Tensor
     what: str
-    of: str = "image"
+    of: str = "image"  # what the entries are: "image", "scene", or "" for entries without a scene
     advice: str = MEND
 
 
 def check_frames(frames: Frames, config: EncoderConfig, dtype: torch.dtype, *, pixels: bool = True) -> None:
-    """Raises an error that names the field that is wrong, and where.
-
-    Args:
-        frames: to encode.
-        config: of the encoder.
-        dtype: of the network, and so of images.
-        pixels: whether to check the values of images too.
-    Raises:
-        InputError: a type, device, shape or index is wrong.
-        NumericalError: a value is not finite or out of range.
-    """
+    """Raises InputError where a type, device, shape or index is wrong, and NumericalError where a value is: the message
+    names the field, and where. ``dtype``: of the network; ``pixels``: whether to check the values of images too."""
     _check_layout(frames, config, dtype)
     wanted = _wanted(frames)
     if pixels:
@@ -76,10 +59,8 @@ def _check_layout(frames: Frames, config: EncoderConfig, dtype: torch.dtype) -> 
     n, _, height, width = images.shape
     multiple = config.size_multiple
     if height % multiple or width % multiple:
-        raise InputError(
-            f"encoder: image height and width must be multiples of {multiple} for this model; got {height} x {width} "
-            "(crop or resize the images and their intrinsics)"
-        )
+        wanted = f"image height and width must be multiples of {multiple} for this model; got {height} x {width}"
+        raise InputError(f"encoder: {wanted} (crop or resize the images and their intrinsics)")
     if (cameras.height, cameras.width) != (height, width):
         raise InputError(f"encoder: cameras are {cameras.height} x {cameras.width} pixels, images {height} x {width}")
     clouds = tuple(frames.cloud_scene.shape[:1])
@@ -118,6 +99,9 @@ def _wanted(frames: Frames) -> list[_Wanted]:
     error = (rotation @ rotation.mT - torch.eye(3, dtype=rotation.dtype, device=rotation.device)).abs().amax((1, 2))
     focal = torch.stack([Ks[:, 0, 0], Ks[:, 1, 1]], 1)
     lower = torch.stack([Ks[:, 1, 0], Ks[:, 2, 0], Ks[:, 2, 1], Ks[:, 2, 2] - 1], 1).abs().amax(1)
+    is_pose = (error <= ROTATION_ERROR) & ((viewmats[:, 3] - last).abs().amax(1) <= 1e-5)
+    is_K = at_most(Ks, MAX_PIXELS) & (focal.amin(1) >= 1 / MAX_PIXELS) & (lower <= 1e-5)
+    of_focal = f"from {1 / MAX_PIXELS:g} to {MAX_PIXELS:g}"
     offset = origin if frames.world_offset is None else frames.world_offset
     finite, size = "must be finite", f"must be at most {FARTHEST:g} m in size"
     in_range = (near >= NEAREST) & (near <= FARTHEST), (far >= NEAREST) & (far <= FARTHEST)
@@ -130,17 +114,9 @@ def _wanted(frames: Frames) -> list[_Wanted]:
         _Wanted("world_offset", at_most(offset, FARTHEST), f"{finite} and at most {FARTHEST:g} m in size", "scene"),
         _Wanted("cameras.viewmats", viewmats.flatten(1).isfinite().all(1), finite),
         _Wanted("cameras.viewmats", at_most(viewmats, FARTHEST), size, advice=NEARER),
-        _Wanted(
-            "cameras.viewmats",
-            (error <= ROTATION_ERROR) & ((viewmats[:, 3] - last).abs().amax(1) <= 1e-5),
-            "must be a rotation and a translation",
-        ),
+        _Wanted("cameras.viewmats", is_pose, "must be a rotation and a translation"),
         _Wanted("cameras.Ks", Ks.flatten(1).isfinite().all(1), finite),
-        _Wanted(
-            "cameras.Ks",
-            at_most(Ks, MAX_PIXELS) & (focal.amin(1) >= 1 / MAX_PIXELS) & (lower <= 1e-5),
-            f"must be [[fx, skew, cx], [0, fy, cy], [0, 0, 1]], fx and fy from {1 / MAX_PIXELS:g} to {MAX_PIXELS:g}",
-        ),
+        _Wanted("cameras.Ks", is_K, f"must be [[fx, skew, cx], [0, fy, cy], [0, 0, 1]], fx and fy {of_focal}"),
         _Wanted("cameras.near", near > 0, "must be positive"),
         _Wanted("cameras.far", (far > near) & far.isfinite(), "must be finite and larger than near"),
         _Wanted("cameras.near", in_range[0], bounds),

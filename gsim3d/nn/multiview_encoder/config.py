@@ -76,9 +76,7 @@ class EncoderConfig:
         cost_unet_dim: channels of the U-Net on the cost volume.
         cost_unet_levels: its resolutions.
         cost_unet_attention: its downsampling factors at which views attend to each other.
-        refine_unet_dim: as ``cost_unet_dim``, of the U-Net on full-resolution images.
-        refine_unet_levels: the same.
-        refine_unet_attention: the same.
+        refine_unet_dim, refine_unet_levels, refine_unet_attention: the same of the U-Net on full-resolution images.
         upsampled_dim: channels of the features brought to full resolution; 0: feature_dim.
         disparity_dim: hidden channels of the full-resolution disparity and opacity head.
         dynamic_dim: channels of the latents that change with time.
@@ -119,10 +117,8 @@ class EncoderConfig:
 
     def __post_init__(self):
         if self.downscale_factor not in (2, 4, 8) or self.downscale_factor > 2 ** len(self.cnn_dims):
-            raise InputError(
-                "EncoderConfig: downscale_factor must be 2, 4 or 8 and at most 2^len(cnn_dims); "
-                f"got {self.downscale_factor}"
-            )
+            wanted = "2, 4 or 8 and at most 2^len(cnn_dims)"
+            raise InputError(f"EncoderConfig: downscale_factor must be {wanted}; got {self.downscale_factor}")
         if self.feature_dim % 4 or self.feature_dim < 4:
             raise InputError(f"EncoderConfig: feature_dim must be a multiple of 4; got {self.feature_dim}")
         if self.n_depths < 2:
@@ -145,24 +141,11 @@ class EncoderConfig:
     def tiny(cls) -> EncoderConfig:
         """Images of 64 pixels in a few tens of milliseconds on two CPU cores."""
         return cls(
-            feature_dim=32,
-            cnn_dims=(16, 32),
-            cnn_blocks=1,
-            transformer_layers=2,
-            transformer_mlp_ratio=1,
-            n_depths=24,
-            cost_unet_dim=32,
-            cost_unet_levels=2,
-            cost_unet_attention=(2,),
-            refine_unet_dim=8,
-            refine_unet_levels=3,
-            refine_unet_attention=(),
+            feature_dim=32, cnn_dims=(16, 32), cnn_blocks=1, transformer_layers=2, transformer_mlp_ratio=1, n_depths=24,
+            cost_unet_dim=32, cost_unet_levels=2, cost_unet_attention=(2,), refine_unet_dim=8, refine_unet_levels=3,
+            refine_unet_attention=(), disparity_dim=16, dynamic_dim=16, static_dim=8, condition_dim=8,
             upsampled_dim=13,  # the heads then read 24 channels, whole vectors
-            disparity_dim=16,
-            dynamic_dim=16,
-            static_dim=8,
-            condition_dim=8,
-        )
+        )  # fmt: skip
 
     @property
     def size_multiple(self) -> int:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from gsim3d import ops
 from gsim3d.nn.layers import widened
 from gsim3d.nn.multiview_encoder.config import EncoderConfig
-from gsim3d.nn.multiview_encoder.layout import GroupNorm, by_pixel, for_convolution
+from gsim3d.nn.multiview_encoder.layout import GroupNorm, by_pixel, for_convolution, two_convolutions
 from gsim3d.nn.multiview_encoder.unet import UNet, repeat_pixels
 
 if TYPE_CHECKING:
@@ -90,9 +90,7 @@ class CostVolume(nn.Module):
         self.unet = UNet(dim, config.cost_unet_levels, config.cost_unet_attention)
         self.refine_out = nn.Conv2d(dim, depths, 3, 1, 1)
         self.residual = nn.Conv2d(in_dim, depths, 1)
-        self.head = nn.Sequential(
-            nn.Conv2d(depths, 2 * depths, 3, 1, 1), nn.GELU(), nn.Conv2d(2 * depths, depths, 3, 1, 1)
-        )
+        self.head = two_convolutions(depths, 2 * depths, depths)
 
     def disparities(self, views: Views, like: Tensor) -> Tensor:
         """[I, D] from 1 / far to 1 / near."""
@@ -150,9 +148,7 @@ class DepthPredictor(nn.Module):
         self.proj_feature = nn.Conv2d(upsampled, dim, 3, 1, 1)
         self.refine_in = nn.Sequential(nn.Conv2d(3 + dim + 2, dim, 3, 1, 1), GroupNorm(4, dim), nn.GELU())
         self.refine_unet = UNet(dim, config.refine_unet_levels, config.refine_unet_attention)
-        self.to_disparity = nn.Sequential(
-            nn.Conv2d(dim, config.disparity_dim, 3, 1, 1), nn.GELU(), nn.Conv2d(config.disparity_dim, 2, 3, 1, 1)
-        )
+        self.to_disparity = two_convolutions(dim, config.disparity_dim, 2)
         last = self.to_disparity[2]
         nn.init.normal_(last.weight, std=INITIAL_OUTPUT / last.in_channels**0.5)
         last.bias.data.copy_(torch.tensor([0.0, math.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY))]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -116,9 +117,8 @@ class Encoder(nn.Module):
             InputError: the encoder has no frozen backbone.
         """
         if not self.has_frozen_backbone:
-            raise InputError(
-                'Encoder.backbone_features: needs backbone "vit_dpt" with vit.frozen "backbone" or "depth"'
-            )
+            needed = 'backbone "vit_dpt" with vit.frozen "backbone" or "depth"'
+            raise InputError(f"Encoder.backbone_features: needs {needed}")
         with tf32_only_if_asked():
             return self.depth.tokens(_views(frames, len(frames.cameras)))
 
@@ -158,18 +158,9 @@ class Encoder(nn.Module):
         activity = torch.full_like(index.pixel, DYNAMIC, dtype=torch.uint8)
         if frames.dynamic is not None:
             activity.masked_fill_(~frames.dynamic.flatten()[index.pixel], FROZEN)
-        activity.masked_fill_(~index.exists, ASLEEP)
-        return Particles(
-            **fields,
-            cu_rows=cu_rows,
-            cloud_scene=cloud_scene,
-            cloud_step=cloud_step,
-            activity=activity,
-            origin=frames.origin,
-            world_offset=frames.world_offset,
-            actions=frames.actions,
-            known=known,
-        )
+        fields["activity"] = activity.masked_fill_(~index.exists, ASLEEP)
+        table = {"cu_rows": cu_rows, "cloud_scene": cloud_scene, "cloud_step": cloud_step, "known": known}
+        return Particles(**fields, **table, **_of_scenes(frames))
 
     def _encode(self, frames: Frames) -> Particles:
         """Clouds with equally many views are encoded together."""
@@ -219,16 +210,16 @@ class Encoder(nn.Module):
         activity = torch.full((order.shape[0] * n_pixels,), DYNAMIC, dtype=torch.uint8, device=order.device)
         if frames.dynamic is not None:
             activity.masked_fill_(~frames.dynamic[order].flatten(), FROZEN)
-        return Particles(
-            **{name: field(name) for name in PixelParticles.__dataclass_fields__},
-            cu_rows=F.pad(per_image.cumsum(0), (1, 0))[F.pad(n_views.cumsum(0), (1, 0))],
-            cloud_scene=frames.cloud_scene,
-            cloud_step=frames.cloud_step,
-            activity=activity if kept is None else activity[index],
-            origin=frames.origin,
-            world_offset=frames.world_offset,
-            actions=frames.actions,
-        )
+        fields = {name: field(name) for name in PixelParticles.__dataclass_fields__}
+        fields["activity"] = activity if kept is None else activity[index]
+        cu_rows = F.pad(per_image.cumsum(0), (1, 0))[F.pad(n_views.cumsum(0), (1, 0))]
+        table = {"cu_rows": cu_rows, "cloud_scene": frames.cloud_scene, "cloud_step": frames.cloud_step}
+        return Particles(**fields, **table, **_of_scenes(frames))
+
+
+def _of_scenes(frames: Frames) -> dict[str, Any]:
+    """What particles have of the scenes that ``frames`` show."""
+    return {"origin": frames.origin, "world_offset": frames.world_offset, "actions": frames.actions}
 
 
 def _views(frames: Frames, n_views: int, geometry: ViewGeometry | None = None) -> Views:

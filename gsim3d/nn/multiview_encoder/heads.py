@@ -13,7 +13,7 @@ from gsim3d.math.spherical_harmonics import degree_damping, rotate_harmonics
 from gsim3d.nn.layers import widened
 from gsim3d.nn.multiview_encoder.config import EncoderConfig
 from gsim3d.nn.multiview_encoder.depth import Depth, Views
-from gsim3d.nn.multiview_encoder.layout import for_convolution
+from gsim3d.nn.multiview_encoder.layout import for_convolution, two_convolutions
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,8 @@ class PixelRays:
 
     def directions(self, height: int, width: int, offset: Tensor) -> Tensor:
         """[I, 3, H, W] world directions of z-depth 1 through pixel centres + ``offset`` [I or 1, 2, H, W] pixels."""
-        v, u = torch.meshgrid(
-            torch.arange(height, device=offset.device) + 0.5,
-            torch.arange(width, device=offset.device) + 0.5,
-            indexing="ij",
-        )
+        ticks = (torch.arange(n, device=offset.device) + 0.5 for n in (height, width))
+        v, u = torch.meshgrid(*ticks, indexing="ij")
         x, y = (offset + torch.stack([u, v]).to(offset.dtype)).split(1, 1)
         to_world = (self.rotations @ self.inverse_Ks).to(offset.dtype)[:, :, :, None, None]
         return to_world[:, :, 0] * x + to_world[:, :, 1] * y + to_world[:, :, 2]
@@ -64,7 +61,7 @@ class Conditioning(nn.Module):
 
     def __init__(self, hidden: int, dim: int):
         super().__init__()
-        self.net = nn.Sequential(nn.Conv2d(10, hidden, 3, 1, 1), nn.GELU(), nn.Conv2d(hidden, 2 * dim, 3, 1, 1))
+        self.net = two_convolutions(10, hidden, 2 * dim)
 
     def forward(self, x: Tensor, depth: Tensor, opacity_logit: Tensor, raw_offset: Tensor, rays: Tensor) -> Tensor:
         """x [I, F, H, W]; depth and opacity_logit [I, 1, H, W]; raw_offset [I, 2, H, W]; rays [I, 6, H, W]."""
@@ -105,9 +102,7 @@ class ParticleHeads(nn.Module):
         dim = config.head_dim
         n_harmonics = (config.sh_degree + 1) ** 2
         n_raw = 2 + (3 + 4 + 3 * n_harmonics if config.explicit else 0)
-        self.to_gaussians = nn.Sequential(
-            nn.Conv2d(dim, 2 * n_raw, 3, 1, 1), nn.GELU(), nn.Conv2d(2 * n_raw, n_raw, 3, 1, 1)
-        )
+        self.to_gaussians = two_convolutions(dim, 2 * n_raw, n_raw)
         n_latents = config.dynamic_dim + config.static_dim
         self.conditioning = Conditioning(config.condition_dim, dim) if n_latents else None
         self.to_latents = nn.Conv2d(dim, n_latents, 3, 1, 1) if n_latents else None
@@ -121,13 +116,8 @@ class ParticleHeads(nn.Module):
         latents = self._latents(depth, raw_offset, geometry, geometry.centers - origin)
         dynamic, static = latents.split([self.config.dynamic_dim, self.config.static_dim], -1)
         explicit = self.explicit_gaussians(raw[:, 2:], depth.depth, geometry) if self.config.explicit else {}
-        return PixelParticles(
-            means=_rows(means),
-            opacities=_rows(depth.opacity_logit.sigmoid())[..., 0],
-            dynamic_latents=dynamic,
-            static_latents=static,
-            **explicit,
-        )
+        opacities = _rows(depth.opacity_logit.sigmoid())[..., 0]
+        return PixelParticles(_rows(means), opacities, dynamic, static, **explicit)
 
     def _latents(self, depth: Depth, raw_offset: Tensor, geometry: PixelRays, centers: Tensor) -> Tensor:
         n_images, _, height, width = depth.depth.shape

@@ -28,6 +28,11 @@ class GroupNorm(nn.GroupNorm):
         return super().forward(_Relaid.apply(x, self.weight.dtype, torch.contiguous_format) if _matters(x) else x)
 
 
+def two_convolutions(dim: int, hidden: int, out_dim: int) -> nn.Sequential:
+    """3x3 convolutions with GELU between them."""
+    return nn.Sequential(nn.Conv2d(dim, hidden, 3, 1, 1), nn.GELU(), nn.Conv2d(hidden, out_dim, 3, 1, 1))
+
+
 def _matters(x: Tensor) -> bool:
     return x.is_cuda and not torch.compiler.is_compiling()
 

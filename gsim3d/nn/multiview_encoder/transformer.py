@@ -80,9 +80,8 @@ class Attention(nn.Module):
         self.merge = nn.Linear(dim, dim, bias=False)
         self.norm1 = RowLayerNorm(dim)
         if mlp_dim:
-            self.mlp = nn.Sequential(
-                nn.Linear(2 * dim, mlp_dim, bias=False), nn.GELU(), nn.Linear(mlp_dim, dim, bias=False)
-            )
+            layers = nn.Linear(2 * dim, mlp_dim, bias=False), nn.GELU(), nn.Linear(mlp_dim, dim, bias=False)
+            self.mlp = nn.Sequential(*layers)
             self.norm2 = RowLayerNorm(dim)
         else:
             self.mlp = None

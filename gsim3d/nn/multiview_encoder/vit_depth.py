@@ -162,8 +162,7 @@ class ViTDepth(nn.Module):
     def _checked(self, features: Tensor, n_images: int, grid: tuple[int, int]) -> Tensor:
         wanted = (n_images, 4, grid[0] * grid[1], self.config.architecture.token_dim)
         if tuple(features.shape) != wanted or features.device != self.log_scale.device:
-            raise InputError(
-                f"encoder: backbone_features must be {list(wanted)} on {self.log_scale.device} for this model; got "
-                f"{list(features.shape)} on {features.device}; make them with Encoder.backbone_features"
-            )
+            wanted, got = f"{list(wanted)} on {self.log_scale.device}", f"{list(features.shape)} on {features.device}"
+            advice = "make them with Encoder.backbone_features"
+            raise InputError(f"encoder: backbone_features must be {wanted} for this model; got {got}; {advice}")
         return features

@@ -99,41 +99,36 @@ def _sparse_conv(device: str) -> float:
 
 def _patch_attn(device: str) -> float:
     stage = _cloud(device).stages[1]
-    table = stage.patches[2]
+    table, n = stage.patches[2], len(stage.grid)
     q_rows, kv_rows, cu_q, cu_k = (t.cpu() for t in (table.q_rows, table.kv_rows, table.cu_q, table.cu_k))
-    n = len(stage.grid)
+    reads = torch.zeros(n, n, dtype=torch.bool)
+    for p in range(len(cu_q) - 1):
+        reads[q_rows[cu_q[p] : cu_q[p + 1], None], kv_rows[cu_k[p] : cu_k[p + 1]]] = True
+
+    def scores(q: Tensor, k: Tensor) -> Tensor:
+        return torch.einsum("ihd,jhd->hij", q, k) * q.shape[-1] ** -0.5
 
     def reference(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-        out = torch.zeros_like(q)
-        for p in range(len(cu_q) - 1):
-            queries, keys = q_rows[cu_q[p] : cu_q[p + 1]], kv_rows[cu_k[p] : cu_k[p + 1]]
-            scores = torch.einsum("ihd,jhd->hij", q[queries], k[keys]) * q.shape[-1] ** -0.5
-            out = out.index_copy(0, queries, torch.einsum("hij,jhd->ihd", scores.softmax(-1), v[keys]))
-        return out
+        return torch.einsum("hij,jhd->ihd", scores(q, k).masked_fill(~reads, -torch.inf).softmax(-1), v)
 
     def lse_reference(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-        out = q.new_zeros(q.shape[:2])
-        for p in range(len(cu_q) - 1):
-            queries, keys = q_rows[cu_q[p] : cu_q[p + 1]], kv_rows[cu_k[p] : cu_k[p + 1]]
-            scores = torch.einsum("ihd,jhd->ihj", q[queries], k[keys]) * q.shape[-1] ** -0.5
-            out = out.index_copy(0, queries, scores.logsumexp(-1))
-        return out + 0 * v.sum()
+        return scores(q, k).masked_fill(~reads, -torch.inf).logsumexp(-1).T + 0 * v.sum()
+
+    def joint_reference(q: Tensor, *keys: Tensor) -> Tensor:
+        k, v = torch.cat(keys[::2]), torch.cat(keys[1::2])
+        return torch.einsum("hij,jhd->ihd", scores(q, k).softmax(-1), v)
 
     def lse(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
         out, found = ops.patch_attention(q, k, v, table, return_lse=True)
         return found + 0 * out.sum()
 
     inputs = [_random(n, 2, 8, seed=seed) for seed in range(5)]
-    alone = _compare(device, lambda q, k, v: ops.patch_attention(q, k, v, table), reference, *inputs[:3])
-    alone = max(alone, _compare(device, lse, lse_reference, *inputs[:3]))
-    rows, cu = torch.arange(n), torch.tensor([0, n])
-    every = ops.PatchTable(*(t.to(device) for t in (rows, rows, cu, cu)))
-
-    def joint_reference(q: Tensor, *keys: Tensor) -> Tensor:
-        k, v = torch.cat(keys[::2]), torch.cat(keys[1::2])
-        return torch.einsum("hij,jhd->ihd", (torch.einsum("ihd,jhd->hij", q, k) * q.shape[-1] ** -0.5).softmax(-1), v)
-
-    return max(alone, _compare(device, lambda *x: ops.joint_attention(*x, every, every), joint_reference, *inputs))
+    every = ops.PatchTable(*(t.to(device) for t in (*[torch.arange(n)] * 2, *[torch.tensor([0, n])] * 2)))
+    return max(
+        _compare(device, lambda q, k, v: ops.patch_attention(q, k, v, table), reference, *inputs[:3]),
+        _compare(device, lse, lse_reference, *inputs[:3]),
+        _compare(device, lambda *x: ops.joint_attention(*x, every, every), joint_reference, *inputs),
+    )
 
 
 def _row_norm(device: str) -> float:
@@ -201,37 +196,44 @@ def _plane_sweep(device: str) -> float:
     return _compare(device, lambda f: ops.plane_sweep(f, *geometry), reference, _random(2, 4, height, width))
 
 
+def _projected(means: Tensor, scales: Tensor, focal: float, center: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixels [N, 2] and entries [N, 3] of the inverse covariances of Gaussians along the axes."""
+    x, y, z = means.unbind(1)
+    zero = torch.zeros_like(z)
+    slopes = torch.stack([focal / z, zero, -focal * x / z**2, zero, focal / z, -focal * y / z**2], 1)
+    J = slopes.reshape(-1, 2, 3)
+    conics = torch.linalg.inv(J @ torch.diag_embed(scales**2) @ J.mT + 0.3 * torch.eye(2)).reshape(-1, 4)
+    return focal * means[:, :2] / means[:, 2:] + center, conics[:, [0, 1, 3]]
+
+
+def _blended(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, size: int) -> Tensor:
+    """An image [1, size, size, D] of Gaussians, the nearest first."""
+    pixel = torch.arange(size) + 0.5
+    image, transmittance = torch.zeros(size, size, colors.shape[1]), torch.ones(size, size)
+    for mean, (a, b, c), opacity, color in zip(means2d, conics, opacities, colors):
+        dx, dy = (torch.stack(torch.meshgrid(pixel, pixel, indexing="xy"), -1) - mean).unbind(-1)
+        alpha = (opacity * torch.exp(-(a * dx * dx + 2 * b * dx * dy + c * dy * dy) / 2)).clamp_max(0.99)
+        alpha = torch.where(alpha >= 1 / 255, alpha, 0.0)
+        image = image + (transmittance * alpha)[..., None] * color
+        transmittance = transmittance * (1 - alpha)
+    return image[None]
+
+
 def _raster(device: str) -> float:
     n, size, focal = 12, 16, 16.0
-    K = torch.tensor([[focal, 0, 7.0], [0, focal, 9.0], [0, 0, 1]])
-    cameras = Cameras(
-        torch.eye(4)[None], K[None], torch.tensor([0.1]), torch.tensor([10.0]), torch.tensor([0]), size, size
-    ).to(device)
-    depth = torch.linspace(2, 3, n)
-    pixel = torch.arange(size) + 0.5
+    K = torch.tensor([[[focal, 0, 7.0], [0, focal, 9.0], [0, 0, 1]]])
+    one, first = torch.ones(1), torch.zeros(1, dtype=torch.int64)
+    cameras = Cameras(torch.eye(4)[None], K, 0.1 * one, 10 * one, first, size, size).to(device)
 
     def reference(means: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor) -> Tensor:
-        image, transmittance = torch.zeros(size, size, 3), torch.ones(size, size)
-        for i in range(n):
-            x, y, z = means[i]
-            slopes = focal / z, 0 * z, -focal * x / z**2, 0 * z, focal / z, -focal * y / z**2
-            J = torch.stack(slopes).reshape(2, 3)
-            conic = torch.linalg.inv(J @ torch.diag(scales[i] ** 2) @ J.T + 0.3 * torch.eye(2))
-            center = torch.stack([focal * x / z + K[0, 2], focal * y / z + K[1, 2]])
-            offset = torch.stack(torch.meshgrid(pixel, pixel, indexing="xy"), -1) - center
-            power = -0.5 * torch.einsum("hwi,ij,hwj->hw", offset, conic, offset)
-            alpha = (opacities[i] * power.exp()).clamp_max(0.99)
-            alpha = torch.where(alpha >= 1 / 255, alpha, 0.0)
-            image = image + (transmittance * alpha)[..., None] * colors[i]
-            transmittance = transmittance * (1 - alpha)
-        return image[None]
+        return _blended(*_projected(means, scales, focal, K[0, :2, 2]), opacities, colors, size)
 
     def function(means: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor) -> Tensor:
         quats = torch.tensor([[1.0, 0, 0, 0]], device=means.device).expand(n, 4)
         return ops.rasterize_gaussians(means, quats, scales, opacities, cameras, colors=colors).color
 
     generator = torch.Generator().manual_seed(4)
-    means = torch.cat([torch.rand(n, 2, generator=generator) - 0.5, depth[:, None]], 1)
+    means = torch.cat([torch.rand(n, 2, generator=generator) - 0.5, torch.linspace(2, 3, n)[:, None]], 1)
     scales = 0.05 + 0.1 * torch.rand(n, 3, generator=generator)
     opacities, colors = 0.2 + 0.5 * torch.rand(n, generator=generator), torch.rand(n, 3, generator=generator)
     return _compare(device, function, reference, means, scales, opacities, colors)
@@ -244,15 +246,11 @@ def _projection(device: str) -> float:
     cameras = Cameras(torch.eye(4)[None], K, one, one, first, 16, 16).to(device)
 
     def reference(means: Tensor, scales: Tensor, sh: Tensor) -> Tensor:
-        x, y, z = means.unbind(1)
-        zero = torch.zeros(n)
-        slopes = torch.stack([focal / z, zero, -focal * x / z**2, zero, focal / z, -focal * y / z**2], 1)
-        J = slopes.reshape(n, 2, 3)
-        conics = torch.linalg.inv(J @ torch.diag_embed(scales**2) @ J.mT + 0.3 * torch.eye(2)).reshape(n, 4)
+        means2d, conics = _projected(means, scales, focal, K[0, :2, 2])
         x, y, z = torch.nn.functional.normalize(means, dim=1).unbind(1)
         basis = torch.stack([0.28209479 + 0 * x, -0.48860251 * y, 0.48860251 * z, -0.48860251 * x], 1)
         colors = (0.5 + torch.einsum("nk,nkc->nc", basis, sh)).clamp_min(0)
-        return torch.cat([focal * means[:, :2] / means[:, 2:] + half, conics[:, [0, 1, 3]], means[:, 2:], colors], 1)
+        return torch.cat([means2d, conics, means[:, 2:], colors], 1)
 
     def function(means: Tensor, scales: Tensor, sh: Tensor) -> Tensor:
         quats = torch.tensor([[1.0, 0, 0, 0]], device=means.device).expand(n, 4)
@@ -266,17 +264,9 @@ def _projection(device: str) -> float:
 
 def _raster_projected(device: str) -> float:
     size, depths = 12, torch.linspace(1, 2, 4)
-    pixel = torch.arange(size) + 0.5
 
-    def reference(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor) -> Tensor:
-        image, transmittance = torch.zeros(size, size, 4), torch.ones(size, size)
-        for mean, (a, b, c), opacity, color in zip(means2d, conics, opacities, colors):
-            dx, dy = (torch.stack(torch.meshgrid(pixel, pixel, indexing="xy"), -1) - mean).unbind(-1)
-            alpha = opacity * torch.exp(-(a * dx * dx + 2 * b * dx * dy + c * dy * dy) / 2)
-            alpha = torch.where(alpha >= 1 / 255, alpha, 0.0)
-            image = image + (transmittance * alpha)[..., None] * color
-            transmittance = transmittance * (1 - alpha)
-        return image[None]
+    def reference(*rows: Tensor) -> Tensor:
+        return _blended(*rows, size)
 
     def function(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor) -> Tensor:
         rows = (means2d, conics, depths.to(means2d.device), opacities, colors)

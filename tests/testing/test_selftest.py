@@ -8,7 +8,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from gsim3d import ops
-from gsim3d.ops import selftest
+from gsim3d.testing import selftest
 
 # What a fused network calls itself (tests/nn/test_fused_block.py), a GPU alone needs, and a CPU alone has.
 NOT_ALONE = {"patch_attention_backward_packed", "sparse_conv_plan", "rasterize_gaussians_backward_tangent"}
