@@ -150,7 +150,8 @@ def test_sdist_becomes_a_wheel_that_predicts_without_a_compiler(sdist, tmp_path)
     python(*pip, "wheel", *offline, "--no-build-isolation", "-w", tmp_path, sdist, cwd=tmp_path, GSIM3D_CUDA="0")
     (wheel,) = tmp_path.glob("*.whl")
     names = zipfile.ZipFile(wheel).namelist()
-    assert "gsim3d/py.typed" in names and len([name for name in names if name.endswith(".so")]) == 2
+    assert {"gsim3d/py.typed", "gsim3d/evaluate/ablations.yaml"} <= set(names)
+    assert len([name for name in names if name.endswith(".so")]) == 2
     # A new environment that has the dependencies of this one, but not its gsim3d: .pth files in there are not read.
     venv.create(tmp_path / "env", with_pip=False)
     fresh = tmp_path / "env" / "bin" / "python"

@@ -8,7 +8,7 @@ from gsim3d.cli.arguments import number, whole
 EPILOG = """\
 Every row is the base run with one change, trained on the same scenes for the same number of steps, and scored on the
 scenes that `gsim3d train` holds out over the same steps. Rows and base runs are declared in
-configs/ablations/paper.yaml, or in the file of --table; --list prints the rows.
+gsim3d/evaluate/ablations.yaml, or in the file of --table; --list prints the rows.
 
 Output in DIR: ablation.md and ablation.json (a table of PSNR with baselines, paired differences, seconds per step, and
 the paper's numbers), and a run folder ROW/seed_N for each training. Run again, the command resumes. Rows and seeds can

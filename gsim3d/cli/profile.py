@@ -16,6 +16,7 @@ settings that retain 99.9 % ("balanced") and 99 % ("fast") of the reference's ga
 An interrupted command continues when it is run again with the same DIR.
 
 examples:
+  gsim3d profile elastic-small --out runs/profile
   gsim3d profile runs/model runs/data --out runs/profile
   gsim3d profile runs/model runs/data --preset full --device cuda --out runs/profile
   gsim3d profile elastic-small data/elastic-unseen --scenes all --settings history "grid size" --out runs/profile
@@ -27,7 +28,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = EPILOG
     add = parser.add_argument
     add("checkpoint", metavar="CHECKPOINT", help=CHECKPOINT_HELP)
-    add("data", metavar="DATA", help="folder with scenes, or one scene folder")
+    data = "folder with scenes, or one scene folder (default: two scenes, generated in DIR/scenes)"
+    add("data", metavar="DATA", nargs="?", help=data)
     scenes = "test: the scenes that `gsim3d train` holds out (default); all: every scene, for a held-out set"
     add("--scenes", choices=("test", "all"), default="test", help=scenes)
     add("--out", metavar="DIR", required=True, help="folder of the report; created if absent")

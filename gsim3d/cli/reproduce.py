@@ -14,7 +14,7 @@ DIR, and the paper's value, which is of other data:
   History length at inference   2 and 1 input steps, beside the model as trained
   Input cameras at inference    3, 2 and 1 cameras, beside the model as trained
   Edits                         thrown, duplicated, without ground, ground raised: a figure, shapes, fall, landing
-  Ablations                     rows of configs/ablations/paper.yaml, trained here (--train)
+  Ablations                     rows of gsim3d/evaluate/ablations.yaml, trained here (--train)
 
 All methods predict the same steps after 4 given ones and are scored from the same cameras. Without --data, scenes of
 `gsim3d generate WORLD --preset published --seed 77` are made in DIR/data. LPIPS and FVD need weights

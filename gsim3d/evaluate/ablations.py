@@ -1,6 +1,6 @@
 """Ablation studies: a base training run and rows that each change one setting, trained and scored under equal terms.
 
-A YAML file declares base runs and rows; configs/ablations/paper.yaml contains those of the paper.
+A YAML file declares base runs and rows; gsim3d/evaluate/ablations.yaml contains those of the paper.
 """
 
 import dataclasses
@@ -33,7 +33,7 @@ from gsim3d.train.loop import Trainer
 from gsim3d.train.restore import model_config, restore
 from gsim3d.train.samples import check_scenes, context_cameras, spread_views
 
-PAPER = Path(gsim3d.__file__).parents[1] / "configs" / "ablations" / "paper.yaml"
+PAPER = Path(__file__).with_name("ablations.yaml")
 PRESET = "tiny"  # default base run
 METRICS = {"psnr_masked": "PSNR masked", "psnr": "PSNR", "psnr_body": "PSNR body"}
 METHODS = ("", "constant.", "copy.")
@@ -58,7 +58,7 @@ class Row:
 def load_ablations(path: Path = PAPER) -> tuple[dict[str, TrainConfig], dict[str, Row]]:
     """Reads (base runs by preset, rows by name) from an ablation file; raises InputError if it is invalid."""
     if not path.is_file():
-        raise InputError(f"{path}: does not exist; --table takes a file like configs/ablations/paper.yaml")
+        raise InputError(f"{path}: does not exist; --table takes a file like {PAPER}")
     content = read_yaml(path)
     if not isinstance(content.get("bases"), dict) or not isinstance(content.get("rows"), list):
         raise InputError(f"{path}: must contain bases and rows")

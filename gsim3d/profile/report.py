@@ -27,10 +27,13 @@ from gsim3d.profile.autotune import PROMISES, part_times, save_speeds, tune
 from gsim3d.profile.settings import GROUPS, KINDS, Group
 from gsim3d.profile.sweep import FULL, NO_TIME, QUICK, REST, BenchmarkCase, Point, Sweep, TimeLimit, front, tie
 from gsim3d.profile.timing import SECTIONS, Timing
+from gsim3d.synth.run import generate
+from gsim3d.synth.worlds import WORLDS
 from gsim3d.train.restore import Restored, restore
 
 FORMAT = 3
 BATCH = 4  # scenes in the batch of the throughput
+FULL_STEPS = 24  # of generated scenes, where whole videos are predicted
 SLOW_METRICS = ("lpips_vgg", "fvd")  # take seconds a setting
 CAPTIONS = {
     "cost.png": "Lost accuracy over the time of a step. Stars: presets of --speed; dashed lines: their limits.",
@@ -56,7 +59,7 @@ agreement."""
 
 def profile(
     checkpoint: str,
-    data: str,
+    data: str | None,
     out: Path,
     *,
     scenes: str = "test",
@@ -71,7 +74,7 @@ def profile(
 
     Args:
         checkpoint: name or run folder.
-        data: folder of scenes, or one scene.
+        data: folder of scenes, or one scene; None: generated scenes, see :func:`generated`.
         out: folder of the report.
         scenes: "test" for the scenes held out in training, or "all".
         preset: "quick" or "full".
@@ -97,6 +100,8 @@ def profile(
     restored = restore(checkpoint, device)
     if out.exists() and not out.is_dir():
         raise InputError(f"--out: {out} is not a folder")
+    if data is None:
+        data, scenes = generated(checkpoint, restored, out / "scenes", effort.n_steps or FULL_STEPS), "all"
     case = BenchmarkCase(restored, _scenes(restored, data, scenes, effort.n_scenes), effort.n_steps, measured)
     out.mkdir(parents=True, exist_ok=True)
     with only_one_writer(out):
@@ -130,6 +135,16 @@ def _groups(names: Sequence[str] | None) -> Sequence[Group]:
         hint = did_you_mean(unknown[0], known)
         raise InputError(f"--settings: unknown name {unknown[0]!r}; settings: {', '.join(map(repr, known))}{hint}")
     return GROUPS if names is None else [known[name] for name in names]
+
+
+def generated(checkpoint: str, restored: Restored, folder: Path, n_steps: int) -> Path:
+    """Generates two scenes in ``folder``, of the world that a shipped simulator is named after, or else of soft bodies,
+    with the image size and frame rate of the training and ``n_steps`` after the input. Returns the folder."""
+    world = next((name for name in WORLDS if Path(checkpoint).name == f"{name}-small"), "elastic")
+    changes = {"image_size": max(restored.image_size), "n_frames": restored.n_encoded + n_steps, "n_trajectories": 2}
+    changes |= {} if restored.fps is None else {"fps": restored.fps}
+    generate(folder, world, preset="published", processes=1, progress=False, **changes)
+    return folder
 
 
 def _scenes(restored: Restored, data: str, which: str, count: int | None) -> list[Scene]:

@@ -14,6 +14,7 @@ from gsim3d.io.settings import to_dict
 from gsim3d.numerics.speed import SPEEDS_FILE, Setting
 from gsim3d.profile import report
 from gsim3d.profile.sweep import Effort, Point, Sweep
+from gsim3d.synth.worlds import build_world
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 ROOT = Path(__file__).parents[2]
@@ -132,6 +133,19 @@ def test_command_lists_settings_skipped_by_time_limit(arguments, tmp_path):
         "history": "a larger --minutes, for history 1;",
         "grid size": "a larger --minutes, for grid 0.5; grid 2;",
     }
+
+
+@pytest.mark.parametrize("name, world", [("cloth-small", "cloth"), ("runs/own", "elastic")])
+def test_scenes_are_generated_for_the_model(name, world, case, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(report, "generate", lambda *given, **options: asked.append((*given, options)))
+    assert report.generated(name, case.restored, tmp_path, n_steps=3) == tmp_path
+    folder, made, options = asked[0]
+    settings = build_world(
+        made, options.pop("preset"), {k: options[k] for k in options.keys() - {"processes", "progress"}}
+    )
+    assert made == world and settings.image_size == case.restored.image_size[0]
+    assert settings.n_frames == case.restored.n_encoded + 3
 
 
 def test_wrong_arguments_are_one_line(capsys, tmp_path):
