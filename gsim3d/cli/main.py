@@ -36,12 +36,6 @@ COMMANDS = {
 RENAMED = {"pareto": "profile"}
 
 
-def _overview() -> str:
-    lines = [f"  {name:<10} {text}" for name, (_, text) in COMMANDS.items()]
-    hints = ["", "A first try: gsim3d demo --out runs/demo", "Help on one command: gsim3d train --help"]
-    return "\n".join(["commands:", *lines, *hints])
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Runs one command; the exit code is 0, or 2 with one line on stderr where the input is wrong."""
     arguments = sys.argv[1:] if arguments is None else arguments
@@ -89,12 +83,10 @@ def _command(arguments: list[str]) -> int:
 
 def _no_command(arguments: list[str]) -> int:
     """Help, the version, or what is wrong with the first word."""
-    parser = Parser(
-        prog="gsim3d",
-        description="Learns 3D simulators from multi-view video.",
-        epilog=_overview(),
-        usage="gsim3d [--help] [--version] COMMAND ...",
-    )
+    lines = [f"  {name:<10} {text}" for name, (_, text) in COMMANDS.items()]
+    hints = ["", "A first try: gsim3d demo --out runs/demo", "Help on one command: gsim3d train --help"]
+    usage, what = "gsim3d [--help] [--version] COMMAND ...", "Learns 3D simulators from multi-view video."
+    parser = Parser(prog="gsim3d", description=what, epilog="\n".join(["commands:", *lines, *hints]), usage=usage)
     parser.add_argument("--version", action="store_true", help="print the version and exit")
     parser.add_argument("command", nargs="?", metavar="COMMAND", help="one of the commands below")
     known, _ = parser.parse_known_args(arguments)

@@ -66,7 +66,9 @@ def read(folder: Path, problems: Problems) -> Recording:
     given = {n: array(e.values.get("offset", 0), [()], f"{e.where}offset", problems) for n, e in entries.items()}
     offsets = {name: 0.0 if offset is None else float(offset) for name, offset in given.items()}
     numbers, rate, notes = _steps(sources, offsets, fps, resample, source, problems)
-    unit, center = _unit(description), _pixel_center(description)
+    unit, center = _unit(description), description.values.get("pixel_center", 0.5)
+    if center not in (0, 0.5):
+        raise InputError(f"{description.where}pixel_center must be 0 (OpenCV's calibration) or 0.5; got {center!r}")
     cameras = [_camera(entry, name, sizes[name], len(numbers[0]), unit, center) for name, entry in entries.items()]
     masks = _masks(folder, description, list(sources.values()))
     labels = sources if masks == "alpha" else None
@@ -137,13 +139,6 @@ def _unit(description: Description) -> float:
     if not isinstance(unit, str) or unit not in UNITS:
         raise InputError(f"{description.where}units must be one of {', '.join(UNITS)}; got {unit!r}")
     return UNITS[unit]
-
-
-def _pixel_center(description: Description) -> float:
-    center = description.values.get("pixel_center", 0.5)
-    if center not in (0, 0.5):
-        raise InputError(f"{description.where}pixel_center must be 0 (OpenCV's calibration) or 0.5; got {center!r}")
-    return center
 
 
 def _camera(entry: Description, name: str, size: tuple[int, int], n_steps: int, unit: float, center: float) -> Camera:

@@ -162,15 +162,11 @@ class SceneTruth:
                 for part, label in EXACT_PARTS.items():
                     parts[part] = self._by_step(torch.where(labels == label, true, images), ["psnr_masked"])
         values |= parts
-        share, n_steps = self._body_share(), len(self.images)
-        return SceneScores(self.name, self.n_encoded, n_steps, values, clips, self.not_measured, share)
-
-    def _body_share(self) -> Tensor | None:
-        """Returns float64 [S]; NaN at steps without foreground."""
-        if self.labels is None:
-            return None
-        bodies, mask = (self.masks[f"psnr_{region}"].sum((2, 3)).double() for region in ("body", "masked"))
-        return (bodies / mask).nanmean(1).cpu()
+        share = None
+        if self.labels is not None:  # NaN at steps without foreground
+            bodies, mask = (self.masks[f"psnr_{region}"].sum((2, 3)).double() for region in ("body", "masked"))
+            share = (bodies / mask).nanmean(1).cpu()
+        return SceneScores(self.name, self.n_encoded, len(self.images), values, clips, self.not_measured, share)
 
     def _problem(self, metric: str) -> str | None:
         """Returns the reason why ``metric`` does not apply to this scene; None if it does."""

@@ -79,7 +79,11 @@ def _build(gs, setup: SceneSetup, folder: Path):
             ),
         )
     bodies = [_add_soft(gs, scene, body, folder / f"body_{index}.obj") for index, body in enumerate(setup.bodies)]
-    cloth = None if setup.cloth is None else _add_cloth(gs, scene, setup.cloth, folder / "cloth.obj")
+    cloth = None
+    if setup.cloth is not None:
+        _write_obj(path := folder / "cloth.obj", setup.cloth.rest_nodes().reshape(-1, 3), grid_faces(setup.cloth.count))
+        material = gs.materials.PBD.Cloth(rho=setup.cloth.mass / setup.cloth.width**2)
+        cloth = scene.add_entity(material=material, morph=gs.morphs.Mesh(file=str(path), file_meshes_are_zup=True))
     scene.build()
     return scene, bodies, cloth
 
@@ -94,14 +98,6 @@ def _add_soft(gs, scene, body: SoftBody, path: Path):
     else:
         chosen = gs.materials.MPM.Elastic(**common)
     return scene.add_entity(material=chosen, morph=gs.morphs.Mesh(file=str(path), file_meshes_are_zup=True))
-
-
-def _add_cloth(gs, scene, cloth: Cloth, path: Path):
-    _write_obj(path, cloth.rest_nodes().reshape(-1, 3), grid_faces(cloth.count))
-    return scene.add_entity(
-        material=gs.materials.PBD.Cloth(rho=cloth.mass / cloth.width**2),
-        morph=gs.morphs.Mesh(file=str(path), file_meshes_are_zup=True),
-    )
 
 
 def _pin(entity, cloth: Cloth) -> np.ndarray:

@@ -173,9 +173,12 @@ class _Soft:
         first = model.flex_nodeadr[flex]
         self.data, self.body, self.bodies = data, body, model.flex_nodebodyid[first : first + model.flex_nodenum[flex]]
         self.shape = (body.cells + 1,) * 3
-        self.rest = _box_grid(body)
+        low, high, part = body.vertices.min(0), body.vertices.max(0), np.arange(body.cells + 1) / body.cells
+        self.rest = np.stack(np.meshgrid(*(a + (b - a) * part for a, b in zip(low, high)), indexing="ij"), -1)
         movable = model.body_dofnum[self.bodies] == 3  # nodes without mass are welded to the world
-        self.occupied = _occupied_cells(body)
+        cell = np.floor((body.vertices - low) / (high - low) * body.cells).astype(np.int64)
+        self.occupied = np.zeros((body.cells,) * 3, dtype=bool)
+        self.occupied[tuple(np.clip(cell, 0, body.cells - 1).T)] = True
         used = np.zeros(self.shape, dtype=bool)
         corners = [tuple(slice(s, s + body.cells) for s in step) for step in np.ndindex(2, 2, 2)]
         for corner in corners:
@@ -226,17 +229,3 @@ class _Cloth:
 
     def embedding(self, nodes: np.ndarray) -> ClothGrid:
         return ClothGrid(nodes)
-
-
-def _box_grid(body: SoftBody) -> np.ndarray:
-    low, high = body.vertices.min(0), body.vertices.max(0)
-    part = np.arange(body.cells + 1) / body.cells
-    return np.stack(np.meshgrid(*(a + (b - a) * part for a, b in zip(low, high)), indexing="ij"), -1)
-
-
-def _occupied_cells(body: SoftBody) -> np.ndarray:
-    low, high = body.vertices.min(0), body.vertices.max(0)
-    cell = np.floor((body.vertices - low) / (high - low) * body.cells).astype(np.int64)
-    occupied = np.zeros((body.cells,) * 3, dtype=bool)
-    occupied[tuple(np.clip(cell, 0, body.cells - 1).T)] = True
-    return occupied

@@ -270,7 +270,9 @@ class _Step:
         if not self._n_future:
             return []
         if plan.spec.dynamics.background == "masked_out":
-            state, plan = _without_background(state), of_prepared_state(plan)
+            left_out, plan = state.activity != DYNAMIC, of_prepared_state(plan)  # the number of particles stays
+            hidden = {"activity": torch.where(left_out, ASLEEP, state.activity)}
+            state = dataclasses.replace(state, opacities=torch.where(left_out, 0.0, state.opacities), **hidden)
         else:
             state = owner.simulator._prepare(state, plan)
         state = displaced(state, self._noise, owner.simulator.config.dynamics.grid_size)
@@ -425,13 +427,6 @@ def _sums(by_call: Sequence[Sequence[Tensor | None]]) -> list[Tensor | None]:
         for k, value in zip(both, added, strict=True):
             total[k] = value
     return total
-
-
-def _without_background(state: Particles) -> Particles:
-    """Puts all but movable particles to sleep with opacity 0, which keeps the number of particles."""
-    left_out = state.activity != DYNAMIC
-    opacities = torch.where(left_out, 0.0, state.opacities)
-    return dataclasses.replace(state, activity=torch.where(left_out, ASLEEP, state.activity), opacities=opacities)
 
 
 def _copy(own: TensorRecord, given: TensorRecord) -> None:

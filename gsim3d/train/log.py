@@ -67,7 +67,7 @@ class Log:
         try:
             with whole_file(self.file) as part, open(self.file, "rb") as lines, open(part, "wb") as retained:
                 while line := lines.readline(MAX_LINE):
-                    if _step_of(line) < step:
+                    if (entry := read_entry(line)) and entry["step"] < step:
                         retained.write(line.rstrip(b"\r\n") + b"\n")
         except OSError as error:
             raise InputError(f"{self.file}: cannot be cut to step {step}: {error.strerror}") from None
@@ -256,11 +256,6 @@ def read_entry(line: bytes) -> dict[str, Any] | None:
     except (ValueError, RecursionError):
         return None
     return entry if isinstance(entry, dict) and is_number(entry.get("step"), int) else None
-
-
-def _step_of(line: bytes) -> float:
-    entry = read_entry(line)
-    return math.inf if entry is None else entry["step"]
 
 
 def check_profile(n_steps: int) -> None:

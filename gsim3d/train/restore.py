@@ -130,13 +130,8 @@ class Restored:
                 f"{scene.path}: depth range {scene.near:g} to {scene.far:g}; the model was trained on "
                 f"{self.data.near_far[0]:g} to {self.data.near_far[1]:g}: open the scene with open_scene, which fits it"
             )
-        self._check_rate(scene)
-
-    def _check_rate(self, scene: Scene) -> None:
-        if self.fps is None or scene.n_steps == 1:
-            return
-        stride = frame_stride(scene.fps, self.fps)
-        if stride != 1:
+        known = self.fps is not None and scene.n_steps > 1
+        if known and (stride := frame_stride(scene.fps, self.fps)) != 1:
             how = f"--resample, or open_scene(folder, resample=True), takes every frame number {stride}"
             remedy = how if stride else "not an integer multiple: resample the scene"
             raise InputError(

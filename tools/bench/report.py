@@ -24,6 +24,8 @@ from pathlib import Path
 import targets
 from harness import RESULTS, commit
 
+from gsim3d.io.machine import processor_name
+
 ROOT = Path(__file__).resolve().parents[2]
 GUARDS, EFFECTS, SLEEPING = "stability", "effects", "sleeping"
 OPS = ["curve", "sparse_conv", "patch_attn", "pool", "row_norm", "plane_sweep", "raster", "decode", "background"]
@@ -120,11 +122,7 @@ def cost_table(rows: list[dict]) -> str:
 
 def processor() -> str:
     info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
-    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
-    flags = next((line for line in lines if line.startswith("flags")), "")
-    wide = ", AVX-512" if "avx512f" in flags else ""
-    return (names[0] if names else platform.processor() or platform.machine()) + wide
+    return processor_name() + (", AVX-512" if info.exists() and "avx512f" in info.read_text() else "")
 
 
 def run(op: str) -> dict:

@@ -87,21 +87,16 @@ class LPIPS(nn.Module):
         x = ((2 * images - 1) - self.shift) / self.scale
         taps = []
         for layer, conv in zip(self.layers, self.convs):
-            if layer.pool == 2:
-                x = _halved(x)
+            if layer.pool == 2:  # a maximum whose gradient needs no atomics
+                height, width = (size // 2 for size in x.shape[2:])
+                blocks = x[:, :, : 2 * height, : 2 * width].unflatten(3, (width, 2)).unflatten(2, (height, 2))
+                x = blocks.amax((3, 5))
             elif layer.pool:
                 x = F.max_pool2d(x, layer.pool, 2)
             x = F.relu(conv(x))
             if layer.tap:
                 taps.append(widened(x))  # under autocast only convolutions are shorter
         return taps
-
-
-def _halved(x: Tensor) -> Tensor:
-    """Max pooling by 2, whose gradient needs no atomics."""
-    height, width = (size // 2 for size in x.shape[2:])
-    blocks = x[:, :, : 2 * height, : 2 * width].unflatten(3, (width, 2)).unflatten(2, (height, 2))
-    return blocks.amax((3, 5))
 
 
 def _unit(features: Tensor) -> Tensor:
