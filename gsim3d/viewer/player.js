@@ -242,6 +242,8 @@ async function main() {
     const [red, green, blue] = header.background;
     gl.clearColor(red, green, blue, 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
+    if (truth.length && player.painted?.[0] !== frame) $("truth").src = "data:image/jpeg;base64," + truth[frame];
+    player.painted = [frame, ticket];
     if (!count) return;
     upload("means", means.order ? frame : 0, spread(part(means, frame), 3));
     upload("scales", scales.order ? frame : 0, spread(part(scales, frame), 3));
@@ -263,7 +265,6 @@ async function main() {
     gl.uniform1i(uniform("nHarmonics"), nHarmonics);
     gl.uniform1i(uniform("antialiased"), header.antialiased);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
-    player.painted = [frame, ticket];
   }
   function draw(now) {
     if (playing) {
@@ -300,13 +301,12 @@ async function main() {
     $("scrub").value = frame;
     $("time").textContent = `${(frame / fps).toFixed(2)} s / ${((frames - 1) / fps).toFixed(2)} s`;
     $("label").textContent = frame < header.start ? "given" : "predicted";
-    if (truth.length) $("truth").src = "data:image/jpeg;base64," + truth[frame];
     changed = true;
   }
   function play(on) {
     if (on && frame === frames - 1 && !looping()) show(0);
     playing = on && frames > 1;
-    $("play").textContent = playing ? "\u23F8" : "\u25B6";
+    $("play").querySelector("path").setAttribute("d", playing ? "M1 0h3v10H1zM6 0h3v10H6z" : "M1 0l9 5-9 5z");
     $("play").setAttribute("aria-label", playing ? "pause" : "play");
   }
   $("scrub").max = frames - 1;

@@ -197,8 +197,10 @@ def test_player_in_browser_equals_rasterizer(tmp_path):
         assert browser.value("player.frame") == 4 and browser.value("document.getElementById('time').textContent") == (
             "0.33 s / 0.75 s"
         )
+        browser.wait("player.idle")
         for frame in (0, 6):
-            browser.value(f"player.show({frame})")
+            before, painted = browser.value(f"(player.show({frame}), [truth.src, player.painted[0]])")
+            assert painted != frame and before.endswith(json.loads(header)["truth"][painted])  # they change together
             browser.wait(f"player.idle && player.painted[0] === {frame}")
             browser.wait(f"truth.naturalWidth === {SIZE} && truth.clientWidth > {SIZE // 2}")
             assert browser.value("truth.src").endswith(json.loads(header)["truth"][frame])
