@@ -69,11 +69,7 @@ BASELINES = {
 
 
 def baseline(name: str, device: str = "cpu") -> SpringGaus:
-    """Returns the baseline ``name`` of BASELINES.
-
-    Raises:
-        InputError: there is no such baseline.
-    """
+    """Returns the baseline ``name`` of BASELINES. Raises InputError if there is none."""
     if name not in BASELINES:
         raise InputError(f"--baselines: {name!r} is not known; choose from {', '.join(BASELINES)}")
     return SpringGaus(name, BASELINES[name], device)

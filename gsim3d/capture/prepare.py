@@ -159,14 +159,8 @@ def _held_out_camera(scene: Scene) -> int:
 
 
 def write_scene(take: Scene, proposal: Proposal, steps: Sequence[int], folder: Path) -> Path:
-    """Writes steps of a take as a scene of the layout videos: cropped, scaled and undistorted, with labels.
-
-    Args:
-        take: result of :func:`open_take`.
-        proposal: crops, size, depths.
-        steps: consecutive steps.
-        folder: scene folder; it appears complete.
-    """
+    """Writes consecutive ``steps`` of a take of :func:`open_take` as a scene of the layout videos, which appears
+    complete: cropped, scaled and undistorted as proposed, with labels."""
     unfinished = folder.with_name(f".{folder.name}")
     shutil.rmtree(unfinished, ignore_errors=True)
     viewmats, Ks = take.recording.cameras_at_step(0)

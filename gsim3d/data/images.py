@@ -271,17 +271,8 @@ class ImageCache:
 
 
 def read_files(files: Iterator[tuple[Path, str]], size, convert, problems: Problems) -> Iterator[np.ndarray | None]:
-    """Reads and converts image files.
-
-    Args:
-        files: pairs of path and "camera, frame" for messages.
-        size: expected (width, height).
-        convert: :func:`as_color`, :func:`as_labels`, :func:`as_mask` or :func:`as_opaque`.
-        problems: receives the errors found.
-
-    Yields:
-        Converted images; None on error.
-    """
+    """Reads image files, pairs of path and "camera, frame" for messages, of the expected ``size``; yields them
+    converted by :func:`as_color`, :func:`as_labels`, :func:`as_mask` or :func:`as_opaque`, None on error."""
     for file, frame in files:
         image = read_image(file, size, frame, problems)
         yield None if image is None else convert(image, file, frame, problems)

@@ -42,13 +42,7 @@ WIDEST = 1.55  # radians from the optical axis; a pinhole image covers less than
 
 
 def lens_of(values: Mapping, what: str, problems: Problems) -> Lens | None:
-    """Parses the lens of a camera description; returns None for a pinhole.
-
-    Args:
-        values: keys of the description.
-        what: name of the camera, for messages.
-        problems: receives unsupported and inconsistent keys.
-    """
+    """Parses the lens of a camera description; returns None for a pinhole. ``what``: the camera, for messages."""
     if key := _unread(values):
         known = ", ".join(COEFFICIENTS)
         problems.add(f"{what}: the lens key {key:.80} is not supported; use {known}, or undistort the images")

@@ -49,15 +49,8 @@ def read(folder: Path, problems: Problems) -> Recording:
 
 
 def recording_of(folder: Path, source: Path, description: dict, frames: list[dict], problems: Problems) -> Recording:
-    """Builds a recording from frames in Nerfstudio's format.
-
-    Args:
-        folder: scene folder, to which the paths of the frames are relative.
-        source: file that describes the scene, for messages.
-        description: fps, near, far, origin and bounds.
-        frames: frames with all their keys, see :func:`frames_of`.
-        problems: receives the errors found.
-    """
+    """Builds a recording from ``frames`` in Nerfstudio's format, see :func:`frames_of`. ``description``: fps, near,
+    far, origin and bounds; ``source``: the file that describes the scene, for messages."""
     if len(frames) > recording.MAX_STEPS:
         raise InputError(f"{source}: {len(frames)} frames exceed the limit of {recording.MAX_STEPS}")
     table, times = _table(frames, source, problems)

@@ -114,10 +114,7 @@ def base_run(
     n_steps: int | None = None,
 ) -> TrainConfig:
     """Returns the base run of a preset or of a ``gsim3d train`` configuration file, in ``n_steps`` optimizer steps.
-
-    Raises:
-        InputError: the preset is unknown, or both ``preset`` and ``config`` are given.
-    """
+    Raises InputError if the preset is unknown, or both ``preset`` and ``config`` are given."""
     if preset is not None and config is not None:
         raise InputError("--preset: cannot be combined with --config, which also defines the base run")
     preset = preset or PRESET

@@ -72,13 +72,8 @@ def _reports(content: dict) -> Iterator[tuple[str, dict]]:
 
 
 def check_same(steps: dict, names: Iterable[str], other: dict, where: str | Path) -> None:
-    """Raises InputError if the report ``other`` has different steps or scenes.
-
-    Args:
-        steps: n_encoded_steps and n_future_steps.
-        names: names of the scenes.
-        where: file of ``other``, for messages.
-    """
+    """Raises InputError if the report ``other``, from the file ``where``, has other ``n_encoded_steps`` or
+    ``n_future_steps`` than ``steps``, or other scenes than ``names``."""
     for key, what in SAME.items():
         if steps.get(key) != other.get(key):
             raise InputError(

@@ -45,11 +45,8 @@ class Proposal:
 
 
 def infer(restored: Restored, scene: Scene, tolerance: float, progress: Callable) -> Proposal:
-    """Finds the smallest spec that loses at most ``tolerance`` dB on ``scene``.
-
-    Args:
-        progress: function number of settings -> context manager of a progress bar.
-    """
+    """Finds the smallest spec that loses at most ``tolerance`` dB on ``scene``. ``progress``: function number of
+    settings -> context manager of a progress bar."""
     base = restored.plan.spec
     settings = smaller_settings(base, restored.simulator.config)
     with progress(2 + sum(map(len, settings.values()))) as bar:

@@ -49,11 +49,8 @@ class Job:
 
 
 def evaluate(job: Job) -> None:
-    """Runs ``job``; prints tables and writes the report.
-
-    Raises:
-        InputError: options contradict each other, or the data do not fit the model.
-    """
+    """Runs ``job``; prints tables and writes the report. Raises InputError if options contradict each other, or the
+    data do not fit."""
     other = None if job.against is None else compare.read_report(job.against)
     if other is not None and job.checkpoint is None and not (job.predictions or job.baselines):
         comparison = compare.compare(compare.read_report(job.data), other, job.against)

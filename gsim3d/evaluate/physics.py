@@ -85,14 +85,9 @@ def _residuals(points: Tensor, bodies: Tensor) -> Tensor:
 def measure_particles(
     particles: Particles, scene: Scene, first: int, truth: Sequence[Tensor] | None
 ) -> dict[str, Tensor]:
-    """Measures the moving particles of clouds ``first`` (the last given step) and later; empty if none moves.
-
-    Args:
-        particles: one cloud a step, those from ``first`` on with the same particles.
-        scene: the scene, for frame rate and bounds.
-        first: index of the last given step.
-        truth: true nodes [N, 3] of each body at that step, to tell bodies apart; None: one body.
-    """
+    """Measures the moving particles of clouds ``first`` (the last given step) and later, one cloud a step with the same
+    particles; empty if none moves. ``truth``: true nodes [N, 3] of each body at ``first``, to tell bodies apart; None:
+    one body."""
     points = moving_points(particles, range(first, particles.n_clouds))
     if points.shape[1] == 0:
         return {}
@@ -103,38 +98,25 @@ def measure_particles(
 
 
 def moving_points(particles: Particles, steps: Sequence[int]) -> Tensor:
-    """Returns the positions [S, N, 3] of the particles that move in the first of ``steps``, on the CPU.
-
-    Args:
-        particles: one cloud a step, those of ``steps`` with the same particles.
-        steps: indices of clouds.
-    """
+    """Returns the positions [S, N, 3], on the CPU, of the particles that move in the first of ``steps``: indices of
+    clouds with the same particles."""
     clouds = [particles.select_clouds(torch.tensor([step])) for step in steps]
     moving = clouds[0].activity == DYNAMIC
     return torch.stack([cloud.means[moving] for cloud in clouds]).cpu()
 
 
 def shape_change(points: Tensor, copies: int = 1) -> float:
-    """Returns how far ``copies`` bodies are from their first shapes at the last step: the largest rms in metres.
-
-    Args:
-        points: [S, N, 3] metres, the points of one copy after those of another.
-        copies: number of bodies with equally many points.
-    """
+    """Returns the largest rms in metres of ``copies`` bodies to their first shapes at the last step of ``points``
+    [S, N, 3], those of one copy after those of another."""
     bodies = torch.arange(copies).repeat_interleave(points.shape[1] // copies)
     last = _residuals(points[[0, -1]].double(), bodies)[0]
     return max(last[bodies == body].square().mean().sqrt().item() for body in range(copies))
 
 
 def fall_ratio(given: Sequence[float], height: float, n_steps: int, fps: float) -> float | None:
-    """Returns how far a body fell over how far a free one would have; None if it is given at one step only.
-
-    Args:
-        given: its mean heights at successive steps, metres; their velocity is fitted under gravity.
-        height: its mean height ``n_steps`` after the last of them.
-        n_steps: number of steps.
-        fps: steps per second.
-    """
+    """Returns how far a body fell over how far a free one would have, from its mean heights ``given`` at successive
+    steps (metres; their velocity is fitted under gravity) to ``height``, ``n_steps`` later; None if it is given at one
+    step only."""
     if len(given) < 2:
         return None
     heights, ago = np.asarray(given[:-1]), np.arange(len(given) - 1, 0, -1) / fps
@@ -144,11 +126,8 @@ def fall_ratio(given: Sequence[float], height: float, n_steps: int, fps: float) 
 
 
 def nearest_body(points: Tensor, truth: Sequence[Tensor]) -> Tensor:
-    """Returns the body int64 [N] that each of ``points`` [N, 3] is on.
-
-    Args:
-        truth: nodes [M, 3] of each body; of the 4 axes of a rigid one, the first is its origin.
-    """
+    """Returns the body int64 [N] that each of ``points`` [N, 3] is on, by the nodes [M, 3] of each body in ``truth``;
+    of the 4 axes of a rigid one, the first is its origin."""
     nodes = [own[:1] if len(own) == 4 else own for own in truth]
     return torch.stack([torch.cdist(points.double(), own.double()).amin(1) for own in nodes]).argmin(0)
 
@@ -161,11 +140,8 @@ def measure_truth(states: Sequence[Tensor], scene: Scene, steps: range) -> dict[
 
 
 def true_states(scene: Scene) -> list[Tensor] | None:
-    """Returns the nodes [T, N, 3] of each body and cloth as generated; None if the scene has no ``states.npz``.
-
-    Raises:
-        InputError: the file is damaged, or does not fit the scene.
-    """
+    """Returns the nodes [T, N, 3] of each body and cloth as generated; None if the scene has no ``states.npz``. Raises
+    InputError if it is damaged, or does not fit the scene."""
     file = scene.path / "states.npz"
     if not file.is_file():
         return None

@@ -158,11 +158,8 @@ def splat_picture(restored: Restored, prediction: Prediction, scene: Scene, cam:
 def write_overview(
     path: str | Path, restored: Restored, scene: Scene, prediction: Prediction, images: Tensor, cam: int
 ) -> None:
-    """Writes an overview picture: input views, Gaussians, and true above predicted frames.
-
-    Args:
-        images: [S, H, W, 3], the prediction rendered from ``cam``.
-    """
+    """Writes an overview picture: input views, Gaussians, and true above predicted frames ``images`` [S, H, W, 3],
+    rendered from ``cam``."""
     plt = pyplot()
     last_given, n_steps = prediction.n_encoded - 1, prediction.n_steps
     inputs = true_images(scene, prediction.context_cams, [last_given])[0]
@@ -200,12 +197,8 @@ def write_overview(
 
 
 def write_curves(path: str | Path, summary: dict, fps: float | None, metrics: Sequence[str] = tuple(METRICS)) -> None:
-    """Plots metrics of every method over time, and for the first method the deviation between scenes.
-
-    Args:
-        fps: steps per second; None: the axis is in steps.
-        metrics: metrics to plot, if the summary has them by step.
-    """
+    """Plots ``metrics`` of every method over time, as far as the summary has them by step, and for the first method the
+    deviation between scenes. ``fps``: steps per second; None: the axis is in steps."""
     plt = pyplot()
     methods, n_encoded = summary["methods"], summary["n_encoded_steps"]
     prefixes = {method: "" if method == "model" else f"{method}." for method in methods}

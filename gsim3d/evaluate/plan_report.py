@@ -38,11 +38,8 @@ class PartTimes:
             raise InputError(f"work must hold counts; got {asdict(self.work)}")
 
     def predicted(self, own: Plan, plan: Plan, model: ModelConfig, work: Workload) -> dict[str, float]:
-        """Predicts the milliseconds of each part under ``plan``, scaling measured times by multiply-adds.
-
-        Args:
-            own: plan of the checkpoint, with which the times were measured.
-        """
+        """Predicts the milliseconds of each part under ``plan`` by multiply-adds from the times, which were measured
+        with ``own``."""
         before, after = predicted_cost(own, model, self.work), predicted_cost(plan, model, work)
         scaled = {part: getattr(self, part) * after[part] / max(before[part], 1.0) for part in after}
         return {**scaled, "host": self.host} if self.host else scaled

@@ -100,10 +100,7 @@ def default_views(
 
 def horizon(scene: Scene, n_encoded: int, n_future: int | None) -> int:
     """Returns the number of steps to predict: ``n_future``, or by default all steps after the first ``n_encoded``.
-
-    Raises:
-        InputError: the scene is too short, or ``n_future`` is below 1.
-    """
+    Raises InputError if the scene is too short, or ``n_future`` is below 1."""
     if n_future is not None:
         _check_count(n_future)
     known = scene.n_steps - n_encoded

@@ -57,11 +57,8 @@ def samples(scene: Scene, prediction: Prediction) -> Samples | None:
 
 
 def collect(restored: Restored, scenes: Sequence[Scene], n_future: int, quiet: bool = False) -> list[Samples]:
-    """Predicts scenes with their spread; returns the samples of those with known motion.
-
-    Raises:
-        InputError: no scene has a known motion.
-    """
+    """Predicts scenes with their spread; returns the samples of those with known motion. Raises InputError if there is
+    none."""
     found = []
     for scene in progress(list(scenes), "trust", unit="scene", quiet=quiet):
         made = samples(scene, predict_together(restored, [scene], n_future, with_spread=True)[0])

@@ -163,13 +163,8 @@ def _keep_speeds(folder: Path, out: Path, *kept) -> Path:
 
 
 def as_dict(case: BenchmarkCase, points: Sequence[Point], presets: dict[str, Point]) -> dict:
-    """Content of report.json for a case; times in milliseconds, memory in MiB.
-
-    Args:
-        case: simulator and scenes.
-        points: measured points, the reference first.
-        presets: preset -> one of ``points``.
-    """
+    """Content of report.json for a case: times in milliseconds, memory in MiB. ``points``: measured ones, the reference
+    first; ``presets``: preset -> one of them."""
     restored, reference = case.restored, points[0]
     best = front(points, lambda p: p.agreement and -p.agreement.psnr)
     rows = []
@@ -246,12 +241,8 @@ def share_in_words(value: float | None) -> str:
 
 
 def cells(content: dict, *, plain: bool = False) -> list[list[str]]:
-    """The table of settings as text: a row of headings, then a row a setting.
-
-    Args:
-        content: content of report.json.
-        plain: numbers with six digits and all metrics, for other programs.
-    """
+    """The table of settings in report.json as text: a row of headings, then a row a setting; ``plain``: numbers with
+    six digits and all metrics, for other programs."""
     metrics = [name for name in content["settings"][0]["task"] if plain or name not in ("psnr_ground", "psnr_ring")]
     columns: list[tuple[str, Callable[[dict], float | None], int]] = [
         ("step ms", lambda row: row["step_ms"]["median"], 2),
@@ -299,12 +290,8 @@ def throughput_in_words(content: dict) -> list[str]:
 
 
 def page(content: dict, pictures: dict[str, bytes]) -> str:
-    """The report as one HTML page without scripts or external files.
-
-    Args:
-        content: content of report.json.
-        pictures: file name -> PNG.
-    """
+    """The report as one HTML page without scripts or external files, of the content of report.json and ``pictures``:
+    file name -> PNG."""
     rows, presets = content["settings"], []
     for name, number in content["presets"].items():
         row = rows[number]

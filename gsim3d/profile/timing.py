@@ -244,15 +244,8 @@ class Timing:
 
 
 def time_call(call: Callable[[], Any], clock: DeviceClock, repeats: int, warm_up: int = 1, sections=None) -> Timing:
-    """Times ``call``, with a device synchronization before and after each repeat.
-
-    Args:
-        call: function to time.
-        clock: clock of its device.
-        repeats: timed calls.
-        warm_up: untimed calls before them.
-        sections: returns the seconds by section of the last call; None: sections are not recorded.
-    """
+    """Times ``repeats`` of ``call`` after ``warm_up`` untimed ones, each between two synchronizations of the ``clock``.
+    ``sections`` returns the seconds by section of the last call; None: they are not recorded."""
     seconds, found = [], []
     for n in range(warm_up + repeats):
         clock.wait()

@@ -21,22 +21,14 @@ MOST_BYTES = 2**26  # of a file
 
 
 class Cells:
-    """The results in OUT/cells, and in OUT/last those that they replaced.
-
-    Args:
-        out: folder of the reproduction.
-    """
+    """The results in OUT/cells, and in OUT/last those that they replaced."""
 
     def __init__(self, out: Path):
         self._now, self._last = out / "cells", out / "last"
 
     def read(self, name: Sequence[str], asked: dict) -> tuple[dict | None, dict | None]:
-        """Returns (cell of ``name`` measured as ``asked``, the one before it); a cell of other terms is the one before.
-
-        Args:
-            name: parts of the cell's path.
-            asked: terms of the measurement: weights, scene, machine.
-        """
+        """Returns (cell of ``name``, the parts of its path, measured as ``asked``: weights, scene, machine; the one
+        before it). A cell of other terms is the one before."""
         cell, before = (_read(self._path(place, name)) for place in (self._now, self._last))
         if cell is None or cell["asked"] == asked:
             return cell, before

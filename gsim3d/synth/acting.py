@@ -170,15 +170,9 @@ def _unit(vector: np.ndarray) -> np.ndarray:
 
 
 def smooth_path(poses: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Path through ``poses`` [P, C] that rests at each of them.
-
-    Args:
-        poses: positions and other numbers to interpolate; the first three are a place.
-        times: [T] ascending from 0; the path ends at 1. The time between two places is proportional to their distance.
-
-    Returns:
-        [T, C].
-    """
+    """Path [T, C] through ``poses`` [P, C], whose first three numbers are a place, that rests at each of them.
+    ``times`` [T] ascend from 0 to the end of the path at 1; the time between two places is proportional to their
+    distance."""
     lengths = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1) + 1e-9
     ends = np.concatenate([[0.0], np.cumsum(lengths)]) / lengths.sum()
     leg = np.clip(np.searchsorted(ends, times, side="right") - 1, 0, len(lengths) - 1)

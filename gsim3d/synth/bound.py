@@ -264,11 +264,8 @@ def _mean_and_error(values: np.ndarray) -> list[float | None]:
 
 
 def read_given(text: str) -> dict[str, float]:
-    """Metric -> PSNR in dB of input steps, from a number or a metrics.json of `gsim3d evaluate`.
-
-    Raises:
-        InputError: ``text`` is neither.
-    """
+    """Metric -> PSNR in dB of input steps, from a number or a metrics.json of `gsim3d evaluate`. Raises InputError if
+    ``text`` is neither."""
     try:
         given = {"psnr_masked": float(text)}
     except ValueError:

@@ -35,19 +35,9 @@ def look_at(position: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def two_rings(n_cams, size, near, far, *, distance, target_height, elevations, fov, turned=0.0) -> Rig:
-    """Cameras on two rings, alternately low and high, that look at a point on the z axis.
-
-    Args:
-        n_cams: number of cameras.
-        size: width and height of the images in pixels.
-        near: smallest visible depth in metres.
-        far: largest visible depth in metres.
-        distance: distance from the target in metres.
-        target_height: height of the target in metres.
-        elevations: (low, high) elevation in degrees.
-        fov: vertical field of view in degrees.
-        turned: rotation of both rings about the z axis in rad.
-    """
+    """Cameras on two rings, alternately at the low and the high of ``elevations`` (degrees), that look at a point on
+    the z axis. ``distance`` and ``target_height`` of that point, ``near`` and ``far`` in metres; images of ``size``
+    pixels; vertical ``fov`` in degrees; ``turned``: rotation of both rings about the z axis in rad."""
     target = np.array([0.0, 0.0, target_height])
     focal = size / 2 / np.tan(np.radians(fov) / 2)
     viewmats = []

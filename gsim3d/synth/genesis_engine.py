@@ -21,16 +21,8 @@ FIX_DISTANCE = 1e-3  # largest distance in metres between a node of the cloth an
 
 
 def simulate(setup: SceneSetup, n_frames: int, fps: float, max_timestep: float) -> list[ParticleCloud | ClothGrid]:
-    """Simulates a scene. Returns the embedding of each body over all frames, and of the cloth last.
-
-    Args:
-        setup: scene with soft bodies only.
-        n_frames: number of frames.
-        fps: frames a second.
-        max_timestep: not used; the time step is TIMESTEP.
-    Raises:
-        Unstable: particles are not finite.
-    """
+    """Simulates a scene with soft bodies only, in steps of TIMESTEP. Returns the embedding of each body over all
+    frames, and of the cloth last. Raises Unstable if particles are not finite."""
     import genesis as gs
 
     if not getattr(gs, "_initialized", False):

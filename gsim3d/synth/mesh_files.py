@@ -43,11 +43,8 @@ class Piece:
 
 
 def read_pieces(path: Path) -> list[Piece]:
-    """Reads all triangles of a mesh file, one piece for each material.
-
-    Raises:
-        InputError: the file cannot be read, or has colours of an unsupported kind.
-    """
+    """Reads all triangles of a mesh file, one piece for each material. Raises InputError if it cannot be read, or has
+    colours of an unsupported kind."""
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"mesh {path}: the supported formats are {', '.join(SUFFIXES)}")
     data = read_file(path, MAX_MESH)

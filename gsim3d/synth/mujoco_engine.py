@@ -32,18 +32,9 @@ def check_solver(data) -> None:
 
 
 def simulate(setup: SceneSetup, n_frames: int, fps: float, max_timestep: float) -> list[Embedding]:
-    """Simulates a scene. Returns the embedding of each body over all frames, and of the cloth last.
-
-    The control grid of a soft body spans the bounding box of its collision mesh at time 0.
-
-    Args:
-        setup: scene at time 0.
-        n_frames: number of frames.
-        fps: frames a second.
-        max_timestep: largest time step in seconds.
-    Raises:
-        Unstable: the solver diverges.
-    """
+    """Simulates a scene in steps of at most ``max_timestep`` seconds. Returns the embedding of each body over all
+    frames (of a soft body a grid that spans the box of its collision mesh at time 0), and of the cloth last. Raises
+    Unstable if the solver diverges."""
     mujoco = load_mujoco()
     substeps = int(np.ceil(1 / (fps * max_timestep) - 1e-9))
     model = mujoco.MjModel.from_xml_string(model_xml(setup, 1 / (fps * substeps)))

@@ -25,15 +25,9 @@ SETTLE = 0.5  # seconds that are simulated before an episode, until bodies rest
 def draw_body(
     name: str, position: np.ndarray, angle: float, size: float = SIZE, rng: np.random.Generator | None = None
 ) -> SceneBody:
-    """Returns a body on the ground.
-
-    Args:
-        name: one of ``synth.bodies.OBJECTS``.
-        position: horizontal position of its center [2] in metres.
-        angle: rotation about the z axis in rad.
-        size: diameter of its enclosing sphere in metres.
-        rng: draws appearance and contacts; None: they depend on the name only.
-    """
+    """Returns the body ``name`` of ``synth.bodies.OBJECTS`` on the ground, with its center at ``position`` [2] in
+    metres, turned by ``angle`` rad about the z axis, in a sphere of diameter ``size`` in metres. ``rng`` draws
+    appearance and contacts; None: they depend on the name only."""
     body = named_body(name, name_rng(name) if rng is None else rng)
     rotation = size * turn_about_z(angle)
     vertices, collision = body.vertices @ rotation.T, body.collision_vertices @ rotation.T

@@ -124,14 +124,8 @@ def check_processes(processes: int | None) -> None:
 
 
 def each(function: Callable, jobs: Sequence[tuple], processes: int | None, shown: str | None) -> Iterator:
-    """Yields the results of ``function`` for all jobs, in order of completion.
-
-    Args:
-        function: module-level function.
-        jobs: arguments of each call.
-        processes: number of processes; None: number of cores.
-        shown: label of the progress bar; None: no bar.
-    """
+    """Yields the results of a module-level ``function`` for the arguments ``jobs``, in order of completion, from
+    ``processes`` (None: one a core). ``shown``: label of the progress bar; None: no bar."""
     from gsim3d.io.terminal import progress
 
     processes = min(processes or len(os.sched_getaffinity(0)), len(jobs))
@@ -172,17 +166,8 @@ def start_data_worker() -> None:
 
 
 def write_trajectory(world: World, scene: tuple[str, int], file: str) -> str:
-    """Writes one trajectory as arrays.
-
-    Args:
-        world: settings of the world.
-        scene: object and sample.
-        file: .npz file to write: images uint8 [T, V, H, W, 4] (RGB and segmentation), viewmats [V, 4, 4] and
-            Ks [V, 3, 3]; with actors also actions [T, A, 3].
-
-    Returns:
-        ``file``.
-    """
+    """Writes trajectory ``scene`` (object, sample) of ``world`` to the .npz ``file``, which is returned: images uint8
+    [T, V, H, W, 4] (RGB and segmentation), viewmats [V, 4, 4] and Ks [V, 3, 3]; with actors also actions [T, A, 3]."""
     made = world.make(*scene)
     images = np.stack([np.concatenate([view.rgb, view.segmentation[..., None]], -1) for view in made.views])
     actions = {} if made.actions is None else {"actions": made.actions}

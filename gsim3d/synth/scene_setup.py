@@ -108,17 +108,9 @@ def check_motion(vertices: np.ndarray, ground: float | None) -> None:
 
 
 def check_energy(centres: np.ndarray, masses: np.ndarray, spin: float, fps: float) -> None:
-    """Raises Unstable if bodies gain energy.
-
-    A compressed body releases its elastic energy within STORED seconds, so the energy of the centers must not grow over
-    longer times.
-
-    Args:
-        centres: centers of the bodies [B, T, 3] in metres.
-        masses: masses [B] in kg.
-        spin: initial rotational energy in J/kg.
-        fps: frames a second.
-    """
+    """Raises Unstable if bodies gain energy over longer than the STORED seconds in which a compressed body releases its
+    own. ``centres`` of the bodies [B, T, 3] in metres, ``masses`` [B] in kg, rotational energy ``spin`` at first in
+    J/kg."""
     if centres.shape[1] < 2:
         return
     speed = np.diff(centres, axis=1) * fps
@@ -142,12 +134,8 @@ def check_cloth(bodies: list[np.ndarray], cloth: np.ndarray, ground: float | Non
 
 
 def depth_below_cloth(points: np.ndarray, cloth: np.ndarray) -> float:
-    """Depth of the deepest point below the cloth in metres; negative if all points are above it.
-
-    Args:
-        points: [N, 3].
-        cloth: grid [n, n, 3]; the height below a point is that of the nearest node.
-    """
+    """Depth of the deepest of ``points`` [N, 3] below the nearest node of ``cloth`` [n, n, 3] in metres; negative if
+    all are above it."""
     nodes = cloth.reshape(-1, 3)
     low, high = nodes[:, :2].min(0), nodes[:, :2].max(0)
     spacing = float(np.max(high - low)) / (cloth.shape[0] - 1)

@@ -107,13 +107,8 @@ def open_subject(path: str | Path | None, device: str = "cpu") -> Subject:
 
 
 def sample_of_scenes(subject: Subject, folders: Sequence[Path], full: bool = False) -> tuple[Sample | None, list[str]]:
-    """Sample of the first steps of up to two valid scenes (None: no scene is valid), and problems of invalid ones.
-
-    Args:
-        subject: simulator to check.
-        folders: scene folders.
-        full: uses four views, the whole history and all particles.
-    """
+    """Sample of the first steps of up to two valid scenes (None: no scene is valid), and problems of invalid ones;
+    ``full``: of four views, the whole history and all particles."""
     scenes, problems = [], []
     for folder in folders:
         if len(scenes) == MAX_SCENES:
@@ -198,15 +193,8 @@ def check(
     only: Sequence[str] = (),
     on_check: Callable = lambda name: None,
 ) -> Iterator[tuple[Finding, Sample]]:
-    """Runs all checks, or those in ``only``, and yields each finding with its sample.
-
-    Args:
-        subject: simulator to check.
-        sample: input of the checks.
-        n_steps: steps of the long rollout.
-        only: names of checks; empty: all.
-        on_check: called with the name of each check before it runs.
-    """
+    """Runs all checks, or those in ``only``, and yields each finding with its sample; the long rollout has ``n_steps``.
+    ``on_check`` is called with the name of each check before it runs."""
     released = isinstance(subject.simulator, ReleasedSimulator)  # its clouds are not independent
     for name in only or CHECKS:
         on_check(name)
@@ -232,13 +220,7 @@ def check(
 
 
 def save_sample(path: Path, sample: Sample, what: dict) -> None:
-    """Writes the sample of a check to a .safetensors file.
-
-    Args:
-        path: file to write.
-        sample: input of the check.
-        what: name of the check and origin of the model.
-    """
+    """Writes the sample of a check to a .safetensors file, with ``what``: name of the check and origin of the model."""
     parts = {"frames": sample.frames, "cameras": sample.frames.cameras, "targets": sample.targets}
     tensors = {f"{part}.{k}": v for part, of in parts.items() for k, v in vars(of).items() if isinstance(v, Tensor)}
     size = {"width": sample.targets.width, "height": sample.targets.height, "n_steps": sample.n_steps}

@@ -46,17 +46,8 @@ class Curves:
 def rollout_curves(
     simulator: Simulator, state: Particles, n_steps: int, plan: Plan | None = None, on_step=None
 ) -> Curves:
-    """Statistics of a rollout, computed in the memory of one step.
-
-    Args:
-        simulator: simulator to test.
-        state: initial state.
-        n_steps: steps of the rollout.
-        plan: what to compute; None: the simulator's default.
-        on_step: called with the newest particles after each step.
-    Raises:
-        NumericalError: as :meth:`Simulator.step`.
-    """
+    """Statistics of a rollout of ``n_steps``, in the memory of one step. ``on_step`` is called with the newest
+    particles after each step. Raises NumericalError as :meth:`Simulator.step`."""
     report, curves = StabilityReport(), Curves([], [], [], [], [])
     for _ in range(n_steps):
         before = last_steps(state, 1)

@@ -172,11 +172,8 @@ class CapturedLoss:
 
     @torch.no_grad()
     def prepare(self, batch: Batch) -> Prepared:
-        """Counts the particles of a batch. Synchronises the device; may be called while a graph runs.
-
-        Raises:
-            InputError, NumericalError: the batch is not a valid input of the encoder.
-        """
+        """Counts the particles of a batch; synchronises the device, also while a graph runs. Raises InputError or
+        NumericalError if the batch is not a valid input of the encoder."""
         context = batch.context
         n_clouds, (n_images, _, *size) = context.cloud_scene.shape[0], context.images.shape
         masks = context.masks
@@ -188,13 +185,8 @@ class CapturedLoss:
         return Prepared(batch, tuple(counts), max(moving), self.simulator.encoder.static_shapes(context, max(counts)))
 
     def __call__(self, prepared: Prepared, weights: Tensor, report: StabilityReport) -> Gradients:
-        """Computes loss and gradients; the next call overwrites the gradients.
-
-        Args:
-            prepared: the batch.
-            weights: [S], weight of each step.
-            report: counts invalid numbers; particles with invalid numbers are put to sleep during a rollout.
-        """
+        """Computes loss and gradients with the ``weights`` [S] of the steps; the next call overwrites the gradients.
+        ``report`` counts invalid numbers; particles with some are put to sleep during a rollout."""
         kind, largest = prepared.kind, max(prepared.counts)
         self.most_particles = max(self.most_particles, largest)
         self.most_moving = max(self.most_moving, prepared.moving)

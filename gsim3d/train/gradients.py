@@ -98,11 +98,8 @@ class StepWatch:
         self._n_particles, self._n_clouds = n_particles, n_clouds
 
     def seen(self, scale: float | None) -> Seen:
-        """Returns the statistics after the backward pass.
-
-        Args:
-            scale: factor of the loss; None: leave out gradient norms.
-        """
+        """Returns the statistics after the backward pass; without gradient norms where ``scale``, the factor of the
+        loss, is None."""
         wrong = ("error", "dropped") if self.strict else ("error",)
         error = next((str(finding.error()) for finding in self.report.findings if finding.action in wrong), None)
         norms = () if scale is None else tuple(norm / scale for norm in self.norms())

@@ -12,13 +12,8 @@ from gsim3d.state import Particles
 
 
 def with_views(particles: Particles, frames: Frames, shapes: StaticShapes | None = None) -> Particles:
-    """Returns encoded particles with their ``view``.
-
-    Args:
-        particles: result of encoding ``frames``.
-        frames: input frames with equally many images in every cloud, sorted by cloud.
-        shapes: as of :meth:`gsim3d.Simulator.encode`.
-    """
+    """Returns particles, encoded from ``frames`` with equally many images in every cloud, sorted by cloud, with their
+    ``view``. ``shapes`` as of :meth:`gsim3d.Simulator.encode`."""
     image = torch.arange(len(frames.cameras), device=particles.means.device) % images_per_cloud(frames)
     view = pixel_rows(frames, image[:, None, None].expand(-1, *frames.images.shape[2:]), shapes)
     return dataclasses.replace(particles, view=view)

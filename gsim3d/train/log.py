@@ -53,11 +53,8 @@ class Log:
         self._stream = None
 
     def cut(self, step: int) -> None:
-        """Removes the entries from ``step`` on, which will be repeated.
-
-        Raises:
-            InputError: the log is not a file, or cannot be read or written.
-        """
+        """Removes the entries from ``step`` on, which will be repeated. Raises InputError if the log is not a file, or
+        cannot be read or written."""
         if not self.writes or not self.file.exists():
             return
         if not self.file.is_file():

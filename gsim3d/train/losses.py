@@ -84,12 +84,7 @@ def mean_by_step(values: Tensor, step: Tensor, n_steps: int) -> Tensor:
 
 
 def image_loss(errors: Tensor, step: Tensor, weights: Tensor) -> Tensor:
-    """Computes ``sum_t weights[t] * mean of errors at step t``.
-
-    Args:
-        errors: [I], error of each image.
-        step: int64 [I], step of each image.
-        weights: [S], from :func:`time_weights`.
-    """
+    """Computes ``sum_t weights[t] * mean of errors at step t`` for the ``errors`` [I] of images at ``step`` int64 [I];
+    ``weights`` [S] of :func:`time_weights`."""
     by_step = mean_by_step(errors, step, weights.shape[0])
     return (weights.to(by_step) * by_step).sum()

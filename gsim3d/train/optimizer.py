@@ -46,13 +46,8 @@ class Optimizer(torch.optim.AdamW):
 
     @torch.no_grad()
     def update(self, gradients: Sequence[Tensor | None], norm: Tensor, rate: float) -> None:
-        """Performs one update; clips ``gradients`` in place.
-
-        Args:
-            gradients: gradient of each parameter, in order; None leaves the parameter unchanged.
-            norm: scalar tensor, global norm of the gradients.
-            rate: learning rate.
-        """
+        """Performs one update at learning ``rate`` with ``gradients`` in the order of the parameters (clipped in place;
+        None leaves one unchanged), whose global ``norm`` is a scalar tensor."""
         for group in self.param_groups:
             group["lr"] = rate * group["factor"]
         if norm.is_cuda:
@@ -105,15 +100,8 @@ def update_average(
     gradients: Sequence[Tensor | None],
     decay: float,
 ) -> None:
-    """Updates an exponential moving average with updated parameters and floating buffers; copies other buffers.
-
-    Args:
-        average: averages by name; changed in place.
-        parameters: parameters by name.
-        buffers: buffers by name.
-        gradients: gradients in the order of ``parameters``; parameters without one are not averaged.
-        decay: decay of the average.
-    """
+    """Updates an exponential moving ``average`` in place with floating buffers and with the updated parameters that
+    have one of ``gradients`` (in the order of ``parameters``); copies other buffers."""
     pairs = zip(parameters.items(), gradients, strict=True)
     weights = {name: parameter for (name, parameter), gradient in pairs if gradient is not None}
     weights |= {name: value for name, value in buffers.items() if value.is_floating_point()}
@@ -124,17 +112,8 @@ def update_average(
 
 
 def one_cycle(step: int, n_steps: int, peak: float, warm_up: float = 0.01) -> float:
-    """Returns the one-cycle learning rate: cosine from peak / 25 to the peak, then cosine to peak / 250 000.
-
-    Args:
-        step: from 0 to n_steps - 1.
-        n_steps: number of steps.
-        peak: peak learning rate.
-        warm_up: fraction of the steps until the peak.
-
-    Source:
-        Smith and Topin 2019, "Super-convergence".
-    """
+    """Returns the one-cycle learning rate (Smith and Topin 2019, "Super-convergence") of ``step`` (from 0) of
+    ``n_steps``: cosine from peak / 25 to the peak within the fraction ``warm_up``, then cosine to peak / 250 000."""
     start, end = peak / START_DIVISOR, peak / START_DIVISOR / END_DIVISOR
     turn = max(1.0, warm_up * n_steps - 1)
     if step <= turn:

@@ -179,12 +179,8 @@ def subsampled(frames: Frames, data: DataConfig) -> Frames:
 
 
 def draw_noise(data: DataConfig, n_context: int, seed: int, step: int, samples: Sequence[int]) -> Tensor | None:
-    """Draws ``data.position_noise`` of all encoded clouds; None: there is none.
-
-    Returns:
-        float64 [Q, WAVES, 7], Q clouds: for each wave the phase's gradient in 1 / cell, the phase, and the amplitude
-        along each axis in metres.
-    """
+    """Draws ``data.position_noise`` of all Q encoded clouds; None: there is none. Returns float64 [Q, WAVES, 7]: for
+    each wave the phase's gradient in 1 / cell, the phase, and the amplitude along each axis in metres."""
     if not data.position_noise:
         return None
     clouds = []
@@ -213,17 +209,9 @@ def displaced(particles: Particles, noise: Tensor | None, cell: float) -> Partic
 
 
 def unfreeze(particles: Particles, most: float, spec: EffectsSpec, rng: np.random.Generator) -> Particles:
-    """Makes a random fraction of the frozen background movable (an augmentation).
-
-    Each scene draws its fraction; space is divided into cubes, and either all or none of the frozen particles of a cube
-    become movable, at all steps.
-
-    Args:
-        particles: particles of one or more scenes.
-        most: largest fraction, 0 to 1.
-        spec: its sleep rule, or the default one, gives the edge length of cubes.
-        rng: random generator; one draw per scene and per cube.
-    """
+    """Makes a random fraction, drawn for each scene up to ``most``, of the frozen background movable (an augmentation).
+    All or none of the frozen particles of a cube become movable, at all steps; the sleep rule of ``spec``, or the
+    default one, gives the edge length of cubes. One draw of ``rng`` per scene and per cube."""
     edge = (spec.dynamics.sleep or Sleep()).halo
     scene = particles.row_scene()
     cube = torch.floor((particles.means.detach().double() - particles.origin[scene]) / edge).nan_to_num().long()

@@ -9,15 +9,9 @@ ROUNDING = 1e-6  # tolerance for colours outside of [0, 1]
 
 
 def as_colors(images: Tensor, name: str) -> Tensor:
-    """Converts ``images`` to float32 or float64 in [0, 1].
-
-    Args:
-        images: floating point, or uint8, which is divided by 255.
-        name: name of the argument, for messages.
-
-    Raises:
-        InputError: another dtype, or values that are not finite or outside of [0, 1].
-    """
+    """Converts ``images``, floating point or uint8 (divided by 255), to float32 or float64 in [0, 1]. Raises
+    InputError, with the ``name`` of the argument, for another dtype, and values that are not finite or outside of
+    [0, 1]."""
     check_colors(images, name)
     if images.dtype == torch.uint8:
         return images.float() / 255

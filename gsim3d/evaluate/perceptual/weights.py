@@ -166,11 +166,8 @@ def load(name: str, build: Callable[[], nn.Module]) -> nn.Module:
 
 
 def store(name: str, content: bytes) -> Path:
-    """Converts the bytes of the published file ``name`` and stores them in the cache; returns the cached file.
-
-    Raises:
-        InputError: the hash is not the expected one.
-    """
+    """Converts the bytes of the published file ``name`` and stores them in the cache; returns the cached file. Raises
+    InputError if its hash is not the expected one."""
     source = SOURCES[name]
     digest = hashlib.sha256(content).hexdigest()
     if digest != source.sha256:
