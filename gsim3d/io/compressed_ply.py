@@ -113,10 +113,10 @@ def _rest(path: Path, tables: dict[str, dict[str, np.ndarray]], count: int) -> n
     """[N, K - 1, 3], the harmonics above degree 0."""
     table = tables.get("sh", {})
     n_rest = len([name for name in table if re.fullmatch(r"f_rest_\d{1,2}", name)])
-    if n_rest not in N_REST or n_rest and len(table["f_rest_0"]) != count:
-        raise InputError(f"{path}: element sh must have {count} rows of 9, 24 or 45 harmonics; got {n_rest}")
     if missing := [f"f_rest_{i}" for i in range(n_rest) if f"f_rest_{i}" not in table]:
         raise InputError(f"{path}: element sh lacks {missing[0]}")
+    if n_rest not in N_REST or n_rest and len(table["f_rest_0"]) != count:
+        raise InputError(f"{path}: element sh must have {count} rows of 9, 24 or 45 harmonics; got {n_rest}")
     levels = np.zeros((count, n_rest), np.float32)
     for i in range(n_rest):
         levels[:, i] = table[f"f_rest_{i}"]

@@ -352,6 +352,15 @@ def test_compressed_ply_is_recognised_by_content(tmp_path):
     assert read_splats(tmp_path / "b.ply").means.shape == (5, 3)
 
 
+@pytest.mark.parametrize("name", [b"f_rest_0", b"f_rest_8"])
+def test_compressed_ply_names_missing_harmonics(name, tmp_path):
+    write_splats(tmp_path / "a.compressed.ply", make(5, 1))
+    content = (tmp_path / "a.compressed.ply").read_bytes()
+    (tmp_path / "a.compressed.ply").write_bytes(content.replace(name, b"f_rest_9", 1))
+    with pytest.raises(InputError, match=f"lacks {name.decode()}"):
+        read_splats(tmp_path / "a.compressed.ply")
+
+
 def moving(n_frames):
     """Frames in which 20 of 60 Gaussians move."""
     first = make(60, 1)
