@@ -89,8 +89,11 @@ def header_of(file: Path, frame: str, problems: Problems) -> Header | None:
     return header
 
 
-def as_color(image: np.ndarray, file: Path, frame: str, problems: Problems) -> np.ndarray:
+def as_color(image: np.ndarray, file: Path, frame: str, problems: Problems) -> np.ndarray | None:
     """Converts to uint8 RGB [h, w, 3]: grey is replicated, 16 bits are rounded to 8, alpha is composited on black."""
+    if image.dtype == np.uint16 and 0 < image.max() <= 255:
+        problems.add(f"image {file} ({frame}) has 16 bits a channel, but no value above 255; save it with 8 bits")
+        return None
     image = _over_black(image)
     if image.dtype == np.uint16:
         image = ((image.astype(np.uint32) + 128) // 257).astype(np.uint8)

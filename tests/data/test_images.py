@@ -276,3 +276,11 @@ def test_cmyk_and_animated_images_are_refused(tmp_path):
     for name, message in (("a.jpg", "is CMYK"), ("a.png", "is animated"), ("a.webp", "is animated")):
         with pytest.raises(InputError, match=f"{name} .*{message}"):
             read_image(tmp_path / name, SIZE, "", Problems())
+
+
+@pytest.mark.parametrize("values", [1, 255])
+def test_16_bit_images_of_8_bit_values_are_refused(tmp_path, values):
+    image = stored(tmp_path, "m.png", discs(values, np.uint16))
+    with pytest.raises(InputError, match="m.png .*no value above 255; save it with 8 bits"):
+        as_color(image, tmp_path / "m.png", "camera a, frame 0", Problems())
+    assert not as_color(image * 0, tmp_path / "m.png", "", Problems()).any()
