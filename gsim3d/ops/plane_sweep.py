@@ -26,7 +26,7 @@ def sweep_geometry(
     Returns:
         homographies [P, 3, 3] and translations [P, 3] (metres), dtype of ``Ks``.
     Gradients:
-        none.
+        of ``Ks``, ``viewmats`` and ``Ks_target``; :func:`plane_sweep` has none of its geometry, and refuses it.
     Raises:
         NumericalError: a matrix is not finite or cannot be inverted; CPU only.
         ValueError, TypeError: an argument has a wrong shape, dtype or range; the message names it.
@@ -39,19 +39,18 @@ def sweep_geometry(
     """
     if not torch.compiler.is_compiling():
         _check_geometry(Ks, viewmats, src_images, cu_src, Ks_target)
-    with torch.no_grad():
-        own = torch.repeat_interleave(
-            torch.arange(Ks.shape[0], device=Ks.device), cu_src[1:] - cu_src[:-1], output_size=src_images.shape[0]
-        )
-        intrinsics, poses = Ks.double(), viewmats.double()
-        target = intrinsics[src_images] if Ks_target is None else Ks_target.double()
-        half_pixel = torch.eye(3, dtype=torch.float64, device=Ks.device)
-        half_pixel[:2, 2] = 0.5
-        relative = poses[src_images] @ _inverse("viewmats", poses)[own]
-        to_index = torch.linalg.inv(half_pixel) @ target
-        homographies = to_index @ relative[:, :3, :3] @ (_inverse("Ks", intrinsics) @ half_pixel)[own]
-        translations = (to_index @ relative[:, :3, 3:])[..., 0]
-        homographies, translations = homographies.to(Ks.dtype), translations.to(Ks.dtype)
+    own = torch.repeat_interleave(
+        torch.arange(Ks.shape[0], device=Ks.device), cu_src[1:] - cu_src[:-1], output_size=src_images.shape[0]
+    )
+    intrinsics, poses = Ks.double(), viewmats.double()
+    target = intrinsics[src_images] if Ks_target is None else Ks_target.double()
+    half_pixel = torch.eye(3, dtype=torch.float64, device=Ks.device)
+    half_pixel[:2, 2] = 0.5
+    relative = poses[src_images] @ _inverse("viewmats", poses)[own]
+    to_index = torch.linalg.inv(half_pixel) @ target
+    homographies = to_index @ relative[:, :3, :3] @ (_inverse("Ks", intrinsics) @ half_pixel)[own]
+    translations = (to_index @ relative[:, :3, 3:])[..., 0]
+    homographies, translations = homographies.to(Ks.dtype), translations.to(Ks.dtype)
     check_numbers("sweep_geometry: of Ks and viewmats", homographies=homographies, translations=translations)
     return homographies, translations
 

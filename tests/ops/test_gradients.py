@@ -196,3 +196,14 @@ def test_arguments_without_gradient_are_refused(name):
         torch.func.jvp(function, (x,), (torch.ones_like(x),))
     with torch.no_grad():
         assert torch.equal(function(x.clone().requires_grad_()), expected)
+
+
+def test_geometry_has_gradients_that_sweeps_refuse():
+    K = torch.tensor([[8.0, 0.1, 4], [0, 9, 3], [0, 0, 1]], dtype=torch.float64).repeat(2, 1, 1).requires_grad_()
+    viewmats = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    viewmats[1, :3, 3] = torch.tensor([0.3, -0.2, 0.1])
+    sources = torch.tensor([1, 0]), torch.tensor([0, 1, 2])
+    geometry = lambda K, viewmats: ops.sweep_geometry(K, viewmats, *sources)  # noqa: E731
+    assert torch.autograd.gradcheck(geometry, (K, viewmats.requires_grad_()))
+    with pytest.raises(GradientError, match="homographies has no gradient"):
+        ops.plane_sweep(values(2, 4, 3, 3).double(), *geometry(K, viewmats), torch.ones(2, 1).double(), *sources)
