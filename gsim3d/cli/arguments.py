@@ -22,7 +22,10 @@ class Parser(argparse.ArgumentParser):
             name = word.partition("=")[0]
             if word.startswith("--") and name not in self._option_string_actions:
                 self.error(f"unrecognized arguments: {name}{did_you_mean(name, self._option_string_actions)}")
-        return self.parse_intermixed_args(arguments)
+        parsed = self.parse_intermixed_args(arguments)
+        if empty := next((name for name, value in vars(parsed).items() if value == "" or value == [""]), None):
+            self.error(f"{empty} must not be empty")
+        return parsed
 
     def error(self, message: str) -> None:
         raise InputError(f"{message} (see {self.prog} --help)")

@@ -103,7 +103,8 @@ def _no_command(arguments: list[str]) -> int:
         parser.error(f"the command comes first: gsim3d {given} ...; got {arguments[0]!r} before it")
     if given in RENAMED:
         parser.error(f"gsim3d {given} is now gsim3d {RENAMED[given]}")
-    parser.error(f"unknown command {given!r}; commands: {', '.join(COMMANDS)}{did_you_mean(given, COMMANDS)}")
+    hint = did_you_mean(given, (*COMMANDS, "--version", "--help"))
+    parser.error(f"unknown command {given!r}; commands: {', '.join(COMMANDS)}{hint}")
 
 
 def _show_warning(otherwise, message, category, *location, **more) -> None:

@@ -21,7 +21,10 @@ def layout_of(folder: str | Path) -> ModuleType:
     """Returns the layout module of a scene folder. Raises InputError if no layout recognises it."""
     found = _find(Path(folder))
     if found is None:
-        raise InputError(f"{folder} is not a scene folder: it has no {_files()} (see docs/reference/data.md)")
+        lacks = (
+            f"scene folder: it has no {_files()} (see docs/reference/data.md)" if Path(folder).is_dir() else "folder"
+        )
+        raise InputError(f"{folder} is not a {lacks}")
     return found
 
 

@@ -21,6 +21,7 @@ from gsim3d.synth.embedding import Embedding, grid_faces
 from gsim3d.synth.scene_setup import Cloth, RigidBody, SceneSetup, SoftBody, Unstable
 
 MAX_ATTEMPTS = 40  # draws of a scene before it fails
+MAX_COUNT, RATES = 1_000_000, (1, 10_000)  # largest number of scenes, frames, pixels or cameras; frames a second
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 MESH_UPS = ("y", "z")
 ENGINES = {"mujoco": "gsim3d.synth.mujoco_engine", "genesis": "gsim3d.synth.genesis_engine"}
@@ -107,9 +108,11 @@ class World(ABC):
     def check(self) -> None:
         """Raises InputError for invalid options."""
         self._check_counts(n_trajectories=1, n_frames=1, image_size=1, n_cams=1, samples=1)
-        for field in ("fps", "max_timestep", "distance", "fov", "ground_radius", "near"):
+        for field in ("max_timestep", "distance", "fov", "ground_radius", "near"):
             if not 0 < getattr(self, field) < np.inf:
                 raise InputError(f"{field} must be positive; got {getattr(self, field)!r}")
+        if not RATES[0] <= self.fps <= RATES[1]:
+            raise InputError(f"fps must be from {RATES[0]} to {RATES[1]}; got {self.fps!r}")
         self._check_ranges("body_size", "drop_height", "n_bodies")
         if not self.near < self.far < np.inf:
             raise InputError(f"far must be above near; got near {self.near} and far {self.far}")
@@ -122,16 +125,19 @@ class World(ABC):
         if not self.seed >= 0:
             raise InputError(f"seed must be 0 or more; got {self.seed}")
         for field, allowed in (("background", BACKGROUNDS), ("mesh_up", MESH_UPS), ("engine", self.engines)):
-            if getattr(self, field) not in allowed:
-                raise InputError(f"{field} must be one of {', '.join(allowed)}; got {getattr(self, field)!r}")
+            if (value := getattr(self, field)) not in allowed:
+                hint = did_you_mean(value, allowed)
+                raise InputError(f"{field} must be one of {', '.join(allowed)}; got {value!r}{hint}")
         for name in self.objects:
             if name not in self.known_objects:
                 known, hint = ", ".join(self.known_objects), did_you_mean(name, self.known_objects)
                 raise InputError(f"object {name!r} is not known; choose from {known}{hint}")
         names = self.object_names()
         repeated = [name for name, count in Counter(names).items() if count > 1]
-        if repeated or not names:
-            raise InputError(f"objects and mesh files must have different names; repeated: {repeated}, all: {names}")
+        if not names:
+            raise InputError("objects: there is neither an object nor a mesh file to simulate")
+        if repeated:
+            raise InputError(f"objects and mesh files must have different names; repeated: {', '.join(repeated)}")
         for path in self.meshes:
             load_mesh(path, self.mesh_up)
         if self.ground:
@@ -140,8 +146,8 @@ class World(ABC):
     def _check_counts(self, **least: int) -> None:
         for field, low in least.items():
             value = getattr(self, field)
-            if not (isinstance(value, int) and value >= low):
-                raise InputError(f"{field} must be a whole number, {low} or more; got {value!r}")
+            if not (isinstance(value, int) and low <= value <= MAX_COUNT):
+                raise InputError(f"{field} must be a whole number from {low} to {MAX_COUNT}; got {value!r}")
 
     def _check_ranges(self, *fields: str) -> None:
         for field in fields:

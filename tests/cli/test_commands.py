@@ -189,7 +189,7 @@ BAD = {
     "no such view": (["evaluate", "{run}", "{data}", "--cameras", "9"], "camera 9 does not exist"),
     "no such input view": (["evaluate", "{run}", "{data}", "--context", "7"], "camera 7 does not exist"),
     "out exists": (["simulate", "{run}", "{scene}", "--out", "{empty}"], "exists already"),
-    "scene is missing": (["simulate", "{run}", "{new}/scene", "--out", "{new}"], "metadata.json"),
+    "scene is missing": (["simulate", "{run}", "{new}/scene", "--out", "{new}"], "is not a folder"),
     "no such camera": (["simulate", "{run}", "{scene}", "--out", "{new}", "--cameras", "9"], "camera 9 does not exist"),
     "no such context camera": (["simulate", "{run}", "{scene}", "--out", "{new}", "--context", "-1"], "at least 0"),
     "no step": (["simulate", "{run}", "{scene}", "--out", "{new}", "--steps", "0"], "at least 1"),
