@@ -8,9 +8,8 @@ docs/reference/data.md.
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +37,7 @@ NAME = "videos"
 FILE = "cameras.json"
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".webm", ".mov", ".avi", ".m4v")
 SHARED_KEYS = ("fps", "resample", "units", "near", "far", "origin", "bounds", "masks", "pixel_center", "cameras")
-CAMERA_KEYS = ("name", "size", "K", "R", "T", "offset", "distortion", "camera_model", "is_fisheye")
+KEYS = (*SHARED_KEYS, "name", "size", "K", "R", "T", "offset", "distortion", "camera_model", "is_fisheye")
 NEAR_NAME = 0.8  # similarity of a key to a known one, above which it is taken for a typing error
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 DISTORTIONS = [(4,), (5,), (8,)]
@@ -116,21 +115,14 @@ def _entries(description: Description) -> dict[str, Description]:
             )
         if name in found:
             raise InputError(f"{description.where}two cameras have the same name: {name}")
-        values = {**shared, **entry}
+        values, where = {**shared, **entry}, f"{description.where}camera {name}: "
         if misplaced := next((key for key in SHARED_KEYS if key in entry), None):
-            raise InputError(
-                f"{description.where}camera {name}: {misplaced} belongs to the top level: it is one for all"
-            )
-        _check_spelling(values, f"{description.where}camera {name}: ")
-        found[name] = Description(values, f"{description.where}camera {name}: ", description.problems)
+            raise InputError(f"{where}{misplaced} belongs to the top level: all cameras have the same")
+        for key in set(values).difference(KEYS):
+            if meant := difflib.get_close_matches(key[:100], KEYS, 1, NEAR_NAME):
+                raise InputError(f"{where}{key:.80} is no key of this file; did you mean {meant[0]}?")
+        found[name] = Description(values, where, description.problems)
     return found
-
-
-def _check_spelling(values: Mapping, where: str) -> None:
-    known = (*SHARED_KEYS, *CAMERA_KEYS)
-    for key in set(values).difference(known):
-        if meant := difflib.get_close_matches(key[:100], known, 1, NEAR_NAME):
-            raise InputError(f"{where}{key:.80} is no key of this file; did you mean {meant[0]}?")
 
 
 def _unit(description: Description) -> float:

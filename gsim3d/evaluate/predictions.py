@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,17 +28,13 @@ RESERVED = ("model", "constant", "copy", "constant_velocity", "release_constant"
             "truth", "past", "future")  # fmt: skip
 
 
+@dataclass(frozen=True)
 class Predictions:
-    """Predicted images of one model for the scenes of a data set.
+    """Predicted images of one model for the scenes of a data set."""
 
-    Attributes:
-        name: name in tables and reports.
-        folder: folder of the predictions.
-        root: folder of the data set.
-    """
-
-    def __init__(self, name: str, folder: Path, root: Path):
-        self.name, self.folder, self.root = name, folder, root
+    name: str  #: name in tables and reports
+    folder: Path  #: folder of the predictions
+    root: Path  #: folder of the data set
 
     @staticmethod
     def open(given: str, root: str | Path) -> Predictions:
@@ -58,7 +55,7 @@ class Predictions:
     def cameras(self, scene: Scene) -> tuple[int, ...]:
         """Returns the cameras with predictions for ``scene``. Raises InputError if there are none."""
         folder = self._scene_folder(scene)
-        stems = {path.stem if path.suffix in VIDEO_SUFFIXES else path.name for path in folder.iterdir()}
+        stems = {path.stem if path.suffix.lower() in VIDEO_SUFFIXES else path.name for path in folder.iterdir()}
         cams = sorted(int(match[1]) for stem in stems if (match := re.fullmatch(r"cam_(\d+)", stem)))
         if not cams:
             raise InputError(f"{folder}: contains neither a folder nor a video named cam_<number>")
@@ -117,8 +114,8 @@ def _find(path: Path, steps: range) -> Path | list[Path]:
     """Returns the video file, or the frame files of ``steps``."""
     if path.is_dir():
         return _frames(path, steps)
-    for suffix in VIDEO_SUFFIXES:
-        if (video := path.with_name(path.name + suffix)).is_file():
+    for video in path.parent.glob(f"{path.name}.*"):
+        if video.suffix.lower() in VIDEO_SUFFIXES:
             return video
     raise InputError(f"{path} is missing: a folder of frames, or a video {path.name}{VIDEO_SUFFIXES[0]}")
 

@@ -27,23 +27,14 @@ Z_TO_Y_UP, Y_TO_Z_UP = (HALF_TURN, -HALF_TURN, 0.0, 0.0), (HALF_TURN, HALF_TURN,
 
 @dataclass(frozen=True)
 class Splats:
-    """One frame of Gaussians, float32 on the CPU.
+    """One frame of Gaussians, float32 on the CPU."""
 
-    Attributes:
-        means: [N, 3] metres; float64 from files.
-        quats: [N, 4] unit, (w, x, y, z).
-        scales: [N, 3] standard deviations, metres, positive.
-        opacities: [N] in [0, 1].
-        sh: [N, K, 3] coefficients of the 3DGS basis, K = (degree + 1)^2.
-        antialiased: as of :class:`gsim3d.state.Gaussians`.
-    """
-
-    means: np.ndarray
-    quats: np.ndarray
-    scales: np.ndarray
-    opacities: np.ndarray
-    sh: np.ndarray
-    antialiased: bool = False
+    means: np.ndarray  #: [N, 3] metres; float64 from files
+    quats: np.ndarray  #: [N, 4] unit, (w, x, y, z)
+    scales: np.ndarray  #: [N, 3] standard deviations, metres, positive
+    opacities: np.ndarray  #: [N] in [0, 1]
+    sh: np.ndarray  #: [N, K, 3] coefficients of the 3DGS basis, K = (degree + 1)^2
+    antialiased: bool = False  #: as of :class:`gsim3d.state.Gaussians`
 
     @property
     def count(self) -> int:
