@@ -8,6 +8,7 @@ docs/reference/data.md.
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
