@@ -46,7 +46,8 @@ class Header:
     @property
     def is_mip(self) -> bool:
         """Whether a comment says so, as MIP does."""
-        return any(re.match(r"splatrendermode\s*:\s*mip", text, re.IGNORECASE) for text in self.comments)
+        said = re.compile(r"splatrendermode\s*:\s*mip|antialiased\s+1\b", re.IGNORECASE)  # Brush, Postshot
+        return any(map(said.match, self.comments))
 
 
 def read_header(path: Path, content: bytes) -> Header:

@@ -6,7 +6,7 @@ SIZES = (9, 1, 3, 3, 4)  # bytes a Gaussian of positions, opacities, colours, sc
 HARMONICS = (0, 9, 24, 45)  # by degree
 
 
-def spz_4(content: bytes, n_streams: int | None = None) -> bytes:
+def spz_4(content: bytes, n_streams: int | None = None, extension: bytes = b"") -> bytes:
     """Version 4 of the unpacked ``content`` of a file in version 3; ``n_streams`` is what its header says."""
     import zstandard
 
@@ -17,6 +17,7 @@ def spz_4(content: bytes, n_streams: int | None = None) -> bytes:
         begin += count * size
     packed = [zstandard.ZstdCompressor().compress(part) for part in parts]
     head = content[:4] + struct.pack("<I", 4) + content[8:15]
-    head += struct.pack("<BI", len(parts) if n_streams is None else n_streams, 32) + bytes(12)
+    head += struct.pack("<BI", len(parts) if n_streams is None else n_streams, 32 + len(extension))
+    head += bytes(12) + extension
     table = b"".join(struct.pack("<QQ", len(p), len(part)) for p, part in zip(packed, parts, strict=True))
     return head + table + b"".join(packed)

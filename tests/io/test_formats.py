@@ -28,8 +28,8 @@ COUNTS = (1, 255, 256, 257)
 BOUNDS = {
     ".ply": (0, 3e-3, 1e-6, 1e-6, 0, 0),
     ".splat": (0, 3e-2, 0, 2e-3, 7e-3, None),
-    ".compressed.ply": (5e-3, 5e-3, 5e-3, 2e-3, 2e-2, 1.6e-2),
-    ".spz": (1.3e-4, 5e-3, 3.2e-2, 2e-3, 1.4e-2, 7e-2),
+    ".compressed.ply": (2.5e-3, 5e-3, 2e-3, 2e-3, 6e-3, 1.6e-2),
+    ".spz": (1.3e-4, 5e-3, 3.2e-2, 2e-3, 1.31e-2, 7e-2),
     ".glb": (0, 3e-3, 0, 0, 0, 1e-6),
     ".usdc": (0, 3e-3, 0, 0, 0, 0),
     ".usda": (0, 3e-3, 0, 0, 0, 0),
@@ -165,7 +165,8 @@ def test_spz_of_version_4_is_read(degree, streams, tmp_path):
     given = make(10, degree)
     write_splats(tmp_path / "three.spz", given)
     content = gzip.decompress((tmp_path / "three.spz").read_bytes())
-    (tmp_path / "four.spz").write_bytes(spz_4(content))
+    extension = struct.pack("<II", 0xADBE0002, 5) + b"orbit"
+    (tmp_path / "four.spz").write_bytes(spz_4(content, extension=extension))
     three, four = read_splats(tmp_path / "three.spz"), read_splats(tmp_path / "four.spz")
     assert all(torch.equal(getattr(three, name), getattr(four, name)) for name in ("means", "quats", "scales", "sh"))
     (tmp_path / "four.spz").write_bytes(spz_4(content, 11 - streams))
@@ -198,6 +199,29 @@ def test_splat_record_by_hand(tmp_path):
     assert read.means.tolist() == [[1, 2, 3]] and read.scales[0].tolist() == pytest.approx([0.1, 0.2, 0.3])
     assert read.opacities.tolist() == pytest.approx([0.4]) and read.quats.tolist() == [[0, 1, 0, 0]]
     assert (0.5 + 0.28209479 * read.sh[0, 0]).tolist() == pytest.approx([1, 0, 0.2], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "position, scale, says",
+    [(np.nan, 0.1, "means holds values that are not finite"), (1, -0.1, "a scale is negative")],
+)
+def test_unusable_values_are_refused(position, scale, says, tmp_path):
+    (tmp_path / "a.splat").write_bytes(struct.pack("<6f", position, 2, 3, 0.1, scale, 0.3) + bytes(8))
+    with pytest.raises(InputError, match=f"a.splat: {says}"):
+        read_splats(tmp_path / "a.splat")
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_formats_render_alike(suffix, tmp_path):
+    """At the degree of the shipped simulators: steps of .spz are twice as large above it."""
+    needs(suffix)
+    given = make(300, 0 if suffix == ".splat" else 1)
+    write_splats(tmp_path / f"a{suffix}", given)
+    view = torch.eye(4)
+    view[2, 3] = 6
+    first, second = (picture(splats_of(g, None, "a"), view) for g in (given, read_splats(tmp_path / f"a{suffix}")))
+    psnr = -10 * np.log10(float((first - second).clamp(-1, 1).square().mean()) + 1e-12)
+    assert psnr > (45 if suffix in (".spz", ".compressed.ply", ".splat") else 60), psnr
 
 
 @pytest.mark.parametrize("degree", range(4))

@@ -267,6 +267,7 @@ def test_read_ply_bounds_rows_with_lists(tmp_path, monkeypatch):
         ([("float", "filter_3D")], ()),
         ([], ("SplatRenderMode: mip",)),
         ([], ("splatrendermode:mip-splatting",)),
+        ([], ("antialiased 1",)),
     ],
 )
 def test_read_ply_knows_antialiased_training(properties, comments, tmp_path):
@@ -290,7 +291,7 @@ def test_filter_3d_is_part_of_scales_and_opacities(tmp_path):
 
 def test_read_ply_of_classic_training(tmp_path, recwarn):
     row = [1, 2, 3, 0, 0, 0, *SHAPE]
-    found = read(tmp_path, rows_of(XYZ + DC + REST, [row], comments=("SplatRenderMode: default",)))
+    found = read(tmp_path, rows_of(XYZ + DC + REST, [row], comments=("SplatRenderMode: default", "antialiased 0")))
     assert not recwarn.list and not found.antialiased
 
 
