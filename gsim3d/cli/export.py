@@ -43,17 +43,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from gsim3d.errors import InputError
-    from gsim3d.viewer.comparison import export_comparison
     from gsim3d.viewer.export import export
+    from gsim3d.viewer.targets import open_target
 
-    given = dict(vars(args))
-    own = {name: given.pop(name) for name in ("scene", "start", "camera")}
     if args.scene is None and (args.start or args.camera):
         raise InputError("--start and --camera belong to --scene")
     if args.scene is None:
-        print(export(**given))
+        print(export(**{name: given for name, given in vars(args).items() if name not in ("scene", "start", "camera")}))
         return 0
     if args.frame is not None or args.up_to or args.turns is not None:
         raise InputError("--frame, --up-to and --turns do not go with --scene: its camera sees every frame")
-    print(export_comparison(args.target, args.to, fps=args.fps, up=args.up, **own))
+    shown = open_target(args.target, scene=args.scene, start=args.start, fps=args.fps, up=args.up)
+    print(shown.export_beside(args.to, args.camera))
     return 0

@@ -29,7 +29,7 @@ from torch import Tensor
 
 from gsim3d import __version__
 from gsim3d.errors import InputError, NumericalError
-from gsim3d.io.files import MAX_TEXT, read_file, read_yaml, sha256_of
+from gsim3d.io.files import MAX_TEXT, read_file, read_yaml, sha256_of, write_whole
 from gsim3d.io.plain import is_number
 from gsim3d.pretrained import located
 
@@ -249,9 +249,7 @@ def export(checkpoint: Checkpoint, path: str | Path) -> None:
         "gsim3d_config": json.dumps({"format": FORMAT, **checkpoint.config}),
         "gsim3d_state": json.dumps({"step": checkpoint.state.get("step", 0), "parent": checkpoint.digest}),
     }
-    part = path.with_name(f".{path.name}.part")
-    part.write_bytes(_bytes_of(checkpoint.weights, metadata))
-    os.replace(part, path)
+    write_whole(path, _bytes_of(checkpoint.weights, metadata))
 
 
 def _bytes_of(tensors: dict[str, Tensor], metadata: dict[str, str] | None = None) -> bytes:

@@ -4,7 +4,7 @@ import hashlib
 import os
 import reprlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,15 +25,15 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def new_output_path(out: str | Path, kind: str = "folder") -> Path:
+def new_output_path(out: str | Path, kind: str = "folder", option: str = "--out") -> Path:
     """The path of a file or folder that a command will make.
 
     Raises:
-        InputError: it exists, or a folder around it is a file; the message starts with ``--out``.
+        InputError: it exists, or a folder around it is a file; the message starts with ``option``.
     """
-    out = output_path(out)
+    out = output_path(out, option=option)
     if out.exists() or out.is_symlink():
-        raise InputError(f"--out: {out} exists already; name another {kind} or remove it")
+        raise InputError(f"{option}: {out} exists already; name another {kind} or remove it")
     return out
 
 
@@ -78,7 +78,8 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     except OSError as error:
         raise OSError(error.errno, error.strerror, str(path)) from None
     finally:
-        part.unlink(missing_ok=True)
+        with suppress(OSError):
+            part.unlink()
 
 
 def write_whole(path: str | Path, *parts: str | bytes) -> None:

@@ -10,15 +10,15 @@ import os
 import signal
 import subprocess
 import sys
+import warnings
 from collections.abc import Iterator, Sequence
-from importlib.util import find_spec
 from itertools import groupby
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from gsim3d.errors import InputError
+from gsim3d.errors import FitWarning, InputError
 from gsim3d.io import usd_child
 from gsim3d.io.arrays import FIELDS, Y_TO_Z_UP, Splats, joined, placed, read_head, turned
 from gsim3d.io.files import whole_file
@@ -33,26 +33,27 @@ def _pxr(path: Path):
 
 
 def write(path: Path, frames: Sequence[Splats], fps: float) -> None:
-    """Writes frames without loss, z up, in metres; a single one without time."""
+    """Writes frames without loss, z up, in metres; a single one without time. Raises InputError where it cannot."""
     Sdf, Usd, UsdGeom, Vt = _pxr(path)
     with whole_file(path) as part:
-        stage = Usd.Stage.CreateNew(str(part))
-        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
-        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-        root = stage.DefinePrim("/Gaussians", "Xform")
-        stage.SetDefaultPrim(root)
-        if len(frames) > 1:
-            stage.SetTimeCodesPerSecond(fps)
-            stage.SetFramesPerSecond(fps)
-            stage.SetStartTimeCode(0)
-            stage.SetEndTimeCode(len(frames) - 1)
-        for begin, span in _spans(frames):
-            for name, chosen in _split(span):
-                prim = stage.DefinePrim(f"/Gaussians/{name}_{begin}", usd_child.TYPE)
-                _field(prim, begin, chosen, Sdf, Vt)
-                _show(UsdGeom.Imageable(prim), begin, begin + len(span), len(frames))
-        stage.GetRootLayer().Save()
-        del stage
+        try:
+            stage = Usd.Stage.CreateNew(str(part))
+            UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+            UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+            stage.SetDefaultPrim(stage.DefinePrim("/Gaussians", "Xform"))
+            if len(frames) > 1:
+                stage.SetTimeCodesPerSecond(fps)
+                stage.SetFramesPerSecond(fps)
+                stage.SetStartTimeCode(0)
+                stage.SetEndTimeCode(len(frames) - 1)
+            for begin, span in _spans(frames):
+                for name, chosen in _split(span):
+                    prim = stage.DefinePrim(f"/Gaussians/{name}_{begin}", usd_child.TYPE)
+                    _field(prim, begin, chosen, Sdf, Vt)
+                    _show(UsdGeom.Imageable(prim), begin, begin + len(span), len(frames))
+            stage.GetRootLayer().Save()
+        except RuntimeError as error:  # of pxr
+            raise InputError(f"{path}: OpenUSD cannot write it: {usd_child.line(error)}") from None
 
 
 def read(path: Path) -> Splats:
@@ -62,16 +63,18 @@ def read(path: Path) -> Splats:
         InputError: it is no USD file, or has no field of Gaussians.
     """
     read_head(path)  # a regular file
-    if not find_spec("pxr"):
-        _pxr(path)
+    _pxr(path)  # is installed
     with TemporaryDirectory() as place:
         out = Path(place) / "arrays.npz"
         if status := _child(str(path), str(out)):
-            raise InputError(f"{path}: damaged, or too large: OpenUSD {_ended(status)} while reading it")
+            ended = signal.Signals(-status).name if status < 0 else f"code {status}"
+            raise InputError(f"{path}: damaged, or too large: OpenUSD was ended by {ended} while reading it")
         with np.load(out) as file:
             found = dict(file)
     if "error" in found:
         raise InputError(f"{path}: {found['error']}")
+    if found["is_moving"]:
+        warnings.warn(f"{path}: only the first frame is read", FitWarning, stacklevel=3)
     unit = found["unit"]
     if not 0 < unit < np.inf:
         raise InputError(f"{path}: metersPerUnit must be positive; got {unit}")
@@ -86,10 +89,6 @@ def _child(file: str, out: str) -> int:
     few = dict.fromkeys(("PXR_WORK_THREAD_LIMIT", "OPENBLAS_NUM_THREADS", "MALLOC_ARENA_MAX"), "1")  # address space
     command = [sys.executable, "-P", usd_child.__file__, file, out]
     return subprocess.run(command, env={**os.environ, **few}, capture_output=True).returncode
-
-
-def _ended(status: int) -> str:
-    return f"was ended by {signal.Signals(-status).name}" if status < 0 else f"ended with code {status}"
 
 
 def _spans(frames: Sequence[Splats]) -> Iterator[tuple[int, list[Splats]]]:

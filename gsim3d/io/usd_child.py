@@ -32,7 +32,7 @@ def main(file: str, out: str) -> None:
     try:
         found = read(file)
     except Exception as error:  # whatever a damaged file brings about
-        says = str(error) if isinstance(error, Refused) else f"damaged, or not a USD file: {_line(error)}"
+        says = str(error) if isinstance(error, Refused) else f"damaged, or not a USD file: {line(error)}"
         found = {"error": np.array(says)}
     np.savez(out, **found)
 
@@ -40,7 +40,7 @@ def main(file: str, out: str) -> None:
 def read(file: str) -> dict[str, np.ndarray]:
     """Arrays of all fields at the first time, joined, by FIELDS; for each its count and its transform, float64 [4, 4].
 
-    Also whether y points up, and metres a unit.
+    Also whether there are later times, whether y points up, and metres a unit.
     """
     from pxr import Usd, UsdGeom
 
@@ -56,6 +56,7 @@ def read(file: str) -> dict[str, np.ndarray]:
     found = {name: np.concatenate(arrays) for name, arrays in zip(FIELDS, zip(*parts))}
     found["counts"], places = np.array([len(part[0]) for part in parts]), UsdGeom.XformCache(time)
     found["places"] = np.array([np.array(places.GetLocalToWorldTransform(prim)).T for prim in fields])
+    found["is_moving"] = np.array(stage.GetEndTimeCode() > stage.GetStartTimeCode())
     is_y_up = UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y
     return found | {"is_y_up": np.array(is_y_up), "unit": np.array(UsdGeom.GetStageMetersPerUnit(stage))}
 
@@ -77,7 +78,7 @@ def _arrays(prim, time) -> list[np.ndarray]:
     return [means, np.roll(quats, 1, 1), scales, opacities[:, 0], sh]  # in memory the real part stands last
 
 
-def _line(error: Exception) -> str:
+def line(error: Exception) -> str:
     """The first line of a message; pxr's may hold bytes of the file."""
     try:
         return next(iter(str(error).strip().splitlines()), "").rpartition(" : ")[2][:100]

@@ -7,7 +7,7 @@ import numpy as np
 
 from gsim3d.errors import InputError
 from gsim3d.io import write_video
-from gsim3d.io.files import new_output_path
+from gsim3d.io.files import new_output_path, with_parents
 from gsim3d.io.formats import format_of, write_splats
 from gsim3d.io.orbit import orbit_frames
 from gsim3d.io.sequence import open_sequence
@@ -65,7 +65,7 @@ def write_frames(
     turns: float | None = None,
 ) -> str:
     """Writes ``count`` frames as the file ``to``, as :func:`export` does, with its arguments and errors."""
-    out = new_output_path(to, "file")
+    out = with_parents(new_output_path(to, "file", "--to"))
     suffix = out.suffix.lower()
     if suffix == ".mp4":
         if size % 2:

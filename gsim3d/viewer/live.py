@@ -14,11 +14,14 @@ from torch import Tensor
 from gsim3d.data import Scene
 from gsim3d.errors import FitWarning, InputError, did_you_mean
 from gsim3d.io.arrays import colors_of, dc_of, splats_of
+from gsim3d.io.files import new_output_path, with_parents
 from gsim3d.io.orbit import picture
+from gsim3d.io.video import write_video
 from gsim3d.math.rotations import rotation_matrices, rotation_to_quat
 from gsim3d.state import ASLEEP, DYNAMIC, FROZEN, Gaussians, Particles
+from gsim3d.viewer import player
 from gsim3d.viewer.export import write_frames
-from gsim3d.viewer.films import turbo
+from gsim3d.viewer.films import film_frames, turbo
 
 COLORINGS = ("appearance", "velocity", "activity", "latents", "trust")
 AWAKE_COLOR, FROZEN_COLOR, ASLEEP_COLOR = (0.95, 0.5, 0.1), (0.55, 0.55, 0.55), (0.2, 0.45, 0.95)
@@ -325,6 +328,31 @@ class Target:
             camera = self.scene.cameras_at([cam], [self.first + frame])
             images.append(picture(gaussians, camera))
         return np.concatenate(images, 1)
+
+    def export_beside(self, path: str | Path, cam: int) -> str:
+        """Writes all frames as a .mp4 or .html file, the truth of a camera beside them; returns one line about it.
+
+        Raises:
+            InputError: the scene lacks the camera, or ``path`` exists or has another suffix.
+        """
+        out, scene = new_output_path(path, "file", "--to"), self.scene
+        if out.suffix.lower() not in (".mp4", ".html"):
+            raise InputError(f"--scene: {path} holds no true images; write .mp4 or .html")
+        if not 0 <= cam < scene.n_cams:
+            raise InputError(f"--camera {cam}: {scene.path} has {scene.n_cams} cameras, from 0")
+        pairs = [self.beside(frame, cam, Layers()) for frame in range(self.n_frames)]
+        truth, predicted = np.split(np.stack(pairs), 2, axis=2)
+        with_parents(out)
+        if out.suffix.lower() == ".mp4":
+            panels = {"truth": truth[:, None], "predicted": predicted[:, None]}
+            write_video(out, film_frames(panels, self.fps), self.fps)
+        else:
+            seen = scene.cameras_at([cam], [self.first])
+            view = player.View(seen.viewmats[0].numpy(), seen.Ks[0].numpy(), seen.width, seen.height)
+            frames = [self.gaussians(frame) for frame in range(self.n_frames)]
+            player.write_player(out, frames, fps=self.fps, title=out.stem, view=view, truth=list(truth))
+        rate = f"{self.n_frames} frames, {self.fps:g} a second"
+        return f"{out}: {rate}, truth beside prediction; {out.stat().st_size / 1e6:.2f} MB"
 
 
 def splatting_of(gaussians: Gaussians, unit: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ import pytest
 import torch
 import trimesh
 
-from gsim3d.errors import InputError
+from gsim3d.errors import FitWarning, InputError
 from gsim3d.io import read_splats, write_splats
 from tests.io.test_formats import make, moving
 
@@ -107,7 +107,8 @@ def test_usd_of_changing_counts_stores_what_rests_once(tmp_path):
 
     frames = [make(30, 1), make(25, 1), *moving(3)]
     write_splats(tmp_path / "a.usdc", frames, fps=10)
-    assert torch.equal(read_splats(tmp_path / "a.usdc").means, frames[0].means)
+    with pytest.warns(FitWarning, match="a.usdc: only the first frame is read"):
+        assert torch.equal(read_splats(tmp_path / "a.usdc").means, frames[0].means)
     stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
     prims = [prim for prim in stage.Traverse() if prim.GetName() != "Gaussians"]
     assert {prim.GetName() for prim in prims} == {"still_0", "still_1", "still_2", "moving_2"}
@@ -163,6 +164,13 @@ def test_damaged_usd_is_refused(tmp_path):
     os.mkfifo(tmp_path / "pipe.usda")
     with pytest.raises(InputError, match="not a file"):
         read_splats(tmp_path / "pipe.usda")
+
+
+def test_usd_that_cannot_be_written_is_named(tmp_path):
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="a.usda: OpenUSD cannot write it: "):
+        write_splats(tmp_path / "file" / "a.usda", make(3, 0))
 
 
 def test_usd_that_crashes_its_library_is_refused(tmp_path):

@@ -3,6 +3,7 @@
 import dataclasses
 import gzip
 import json
+import re
 import struct
 import tracemalloc
 
@@ -474,14 +475,15 @@ def test_export_command_writes_files_and_videos(tmp_path, capsys):
     assert "not kept" in capsys.readouterr().out
     for arguments, says in (
         ([str(folder), "--to", str(tmp_path / "b.spz")], "--frame"),
-        ([str(folder), "--to", str(tmp_path / "last.spz")], "exists already"),
+        ([str(folder), "--to", str(tmp_path / "last.spz")], "--to: .*exists already"),
         ([str(folder), "--frame", "3", "--to", str(tmp_path / "b.spz")], "3 frames"),
         ([str(folder), "--to", str(tmp_path / "b.obj")], "suffix"),
         ([str(tmp_path / "none"), "--to", str(tmp_path / "b.spz")], "no such file"),
         ([str(folder), "--to", str(tmp_path / "b.mp4"), "--size", "33"], "--size"),
     ):
         assert main(["export", *arguments]) == 2
-        assert says in capsys.readouterr().err
+        assert re.search(says, capsys.readouterr().err)
+    assert main(["export", str(folder), "--frame", "0", "--to", str(tmp_path / "new" / "folder" / "b.splat")]) == 0
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz", ".glb"])
