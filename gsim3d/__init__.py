@@ -25,10 +25,11 @@ _HOME = {
     "gsim3d.state": "Actions Gaussians Particles",
     "gsim3d.ops": """
         CURVES KernelMap PartialRecord PatchTable Projection Pyramid PyramidCapacity PyramidSpec Rendering Segments
-        Stage ValidatedState Voxels add_cells build_pyramid cuda_compiled curve_encode curve_sort decode_gaussians
-        find_cells join_records joint_attention norm_gelu overlapping_patches patch_attention plane_sweep pool_max
-        pool_mean project_gaussians rasterize_gaussians rasterize_projected residual_norm row_norm row_scenes
-        sh_to_color segment_min segment_softmax segment_sum sparse_conv sweep_geometry unpool validate_state
+        SpringLists Stage ValidatedState Voxels add_cells advance_springs build_pyramid cuda_compiled curve_encode
+        curve_sort decode_gaussians find_cells join_records joint_attention norm_gelu overlapping_patches
+        patch_attention plane_sweep pool_max pool_mean project_gaussians rasterize_gaussians rasterize_projected
+        residual_norm row_norm row_scenes sh_to_color segment_min segment_softmax segment_sum sparse_conv
+        sweep_geometry unpool validate_state
     """,
 }
 _MODULE_OF = {name: module for module, names in _HOME.items() for name in names.split()}

@@ -30,6 +30,7 @@ from gsim3d.ops.raster_projected import rasterize_projected
 from gsim3d.ops.row_norm import norm_gelu, residual_norm, row_norm
 from gsim3d.ops.segment import segment_min, segment_softmax, segment_sum
 from gsim3d.ops.sparse_conv import sparse_conv
+from gsim3d.ops.springs import SpringLists, advance_springs
 from gsim3d.ops.validate_state import PartialRecord, ValidatedState, join_records, validate_state
 
 __all__ = [
@@ -43,10 +44,12 @@ __all__ = [
     "PyramidSpec",
     "Rendering",
     "Segments",
+    "SpringLists",
     "Stage",
     "ValidatedState",
     "Voxels",
     "add_cells",
+    "advance_springs",
     "build_pyramid",
     "cuda_compiled",
     "curve_encode",

@@ -313,6 +313,32 @@ def _background(device: str) -> float:
     return _compare(device, lambda x, f: ops.add_cells(x, f, places), lambda x, f: x + f[places.cpu()], x, field)
 
 
+def _springs(device: str) -> float:
+    ends, of_rows = torch.arange(1, 31) % 30, torch.arange(31)
+    lists = ops.SpringLists.from_neighbors(ends.to(device), of_rows.to(device))
+    rest = torch.arange(90.0).reshape(30, 3).sin()
+    numbers = {"lengths": (rest[ends] - rest).norm(dim=1), "damping": torch.ones(30), "external": torch.zeros(30, 3)}
+    options = {"seconds": 0.1, "substeps": 2, "ground": -0.9, "power": 0.0}
+
+    def function(x: Tensor, stiffness: Tensor, grip: Tensor) -> Tensor:
+        of = {name: value.to(device) for name, value in numbers.items()}
+        return torch.cat(ops.advance_springs(1.1 * x, x, lists, stiffness=stiffness, grip=grip, **of, **options))
+
+    def reference(x: Tensor, stiffness: Tensor, grip: Tensor) -> Tensor:
+        x, v = 1.1 * x, x
+        for _ in range(2):
+            apart, faster = x[ends] - x, v[ends] - v
+            distance = apart.norm(dim=1, keepdim=True)
+            pull = stiffness[:, None] * (distance - numbers["lengths"][:, None]) * apart / distance
+            v = v + 0.05 * (pull + (faster * apart).sum(1, keepdim=True) * apart / distance**2)
+            x = x + 0.05 * v
+            touching, slowed = x[:, 2:] <= -0.9, torch.cat([grip[:, None] * v[:, :2], 0 * v[:, 2:]], 1)
+            x, v = torch.cat([x[:, :2], x[:, 2:].clamp_min(-0.9)], 1), torch.where(touching, slowed, v)
+        return torch.cat([x, v])
+
+    return _compare(device, function, reference, rest, torch.ones(30), torch.full((30,), 0.5))
+
+
 def _validate_state(device: str) -> float:
     means, opacities, cu_rows = _random(50, 3), torch.linspace(0, 1, 50), torch.tensor([0, 20, 50])
     means[7, 1], opacities[30] = torch.nan, 2.0
@@ -343,6 +369,7 @@ CHECKS: dict[str, Callable[[str], float]] = {
     "plane_sweep": _plane_sweep,
     "decode": _decode,
     "background": _background,
+    "springs": _springs,
     "validate_state": _validate_state,
     "raster": _raster,
     "projection": _projection,

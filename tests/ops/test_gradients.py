@@ -12,6 +12,8 @@ from gsim3d.math.spherical_harmonics import readings
 
 ROWS, CU = torch.arange(6), torch.tensor([0, 2, 6])
 READINGS = readings(torch.float32, torch.device("cpu"))
+RING = ops.SpringLists.from_neighbors((ROWS + 1) % 6, torch.arange(7))
+SPRING_NUMBERS = ("lengths", "stiffness", "damping", "grip", "external")
 TABLE = ops.PatchTable(ROWS, ROWS, CU, CU)
 
 
@@ -83,6 +85,12 @@ CALLS = {
     "decode_gaussians": (
         lambda raw: ops.decode_gaussians(raw, READINGS, degree=1, scale_min=0.1, scale_max=1.0)[2],
         [values(6, 19)],
+    ),
+    "advance_springs": (
+        lambda x, v, *numbers: ops.advance_springs(
+            x, v, RING, **dict(zip(SPRING_NUMBERS, numbers, strict=True)), seconds=0.1, substeps=3, ground=-9.0
+        )[0],
+        [MEANS, values(6, 3), 1 + values(6) ** 2, values(6), values(6), values(6), values(6, 3)],
     ),
     "add_cells": (lambda x, field: ops.add_cells(x, field, ROWS % 2), [values(6, 3), values(2, 3)]),
     "plane_sweep": (sweep, [values(2, 4, 3, 3)]),

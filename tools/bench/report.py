@@ -29,7 +29,7 @@ from gsim3d.io.machine import processor_name
 ROOT = Path(__file__).resolve().parents[2]
 GUARDS, EFFECTS, SLEEPING = "stability", "effects", "sleeping"
 OPS = ["curve", "sparse_conv", "patch_attn", "pool", "row_norm", "plane_sweep", "raster", "decode", "background"]
-OPS.append(SLEEPING)
+OPS += ["springs", SLEEPING]
 NUMBERS, STEPS = ROOT / "docs" / "results" / "benchmarks.json", RESULTS / "training.json"
 GPU = """
 ## On a GPU

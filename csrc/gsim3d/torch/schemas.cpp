@@ -115,6 +115,17 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "inverse_depths, "
       "Tensor src_images, Tensor cu_src) -> Tensor");
 
+  // springs: substeps of anchors on springs above a ground; state [2, N, 3]; kept [K, 2, N, 3] for the backward pass.
+  m.def(
+      "advance_springs(Tensor state, Tensor neighbors, Tensor cu_springs, Tensor sources, Tensor cu_sources, Tensor "
+      "lengths, Tensor stiffness, Tensor damping, Tensor grip, Tensor external, float seconds, int substeps, float "
+      "ground, float power) -> (Tensor state, Tensor kept)");
+  m.def(
+      "advance_springs_backward(Tensor grad, Tensor last, Tensor kept, Tensor state, Tensor neighbors, Tensor "
+      "cu_springs, Tensor sources, Tensor cu_sources, Tensor lengths, Tensor stiffness, Tensor damping, Tensor grip, "
+      "Tensor external, float seconds, int substeps, float ground, float power) -> (Tensor state, Tensor lengths, Tensor "
+      "stiffness, Tensor damping, Tensor grip, Tensor external)");
+
   // projection: 3D Gaussians into images without blending them, P pairs of a row and an image; lens 0 pinhole, 1
   // orthographic, 2 opencv, 3 fisheye. Of the gradient, what is not wanted is empty.
   m.def(

@@ -25,7 +25,7 @@ from tests.stability.fuzz.poison import mutate, tensor
 
 EXPECTED = (ValueError, TypeError, MemoryError)
 Arguments = dict[str, Any]
-STRUCTURES = ("cameras", "voxels", "kernel_map", "table", "spec", "fields")  # arguments that hold the others
+STRUCTURES = ("cameras", "voxels", "kernel_map", "table", "spec", "fields", "springs")  # arguments that hold the others
 
 
 def _size(rng: random.Random, most: int = 12) -> int:
@@ -336,6 +336,25 @@ def _call_decode(a: Arguments):
     return ops.decode_gaussians(**a, readings=readings(wide, device))
 
 
+def _springs(rng: random.Random) -> Arguments:
+    n, dtype = _size(rng), _dtype(rng)
+    s = 2 * n
+    neighbors = torch.tensor([rng.randrange(n) for _ in range(s)], dtype=torch.int64)
+    lists = ops.SpringLists.from_neighbors(neighbors, _offsets(rng, s, n))._asdict()
+    of_springs = {name: tensor(rng, s, dtype=dtype).abs() + 0.1 for name in ("lengths", "stiffness", "damping")}
+    of_anchors = {name: tensor(rng, n, 3, dtype=dtype) for name in ("positions", "velocities", "external")}
+    more = {"grip": tensor(rng, n, dtype=dtype).sigmoid(), "seconds": 0.1, "substeps": rng.choice((1, 2, 5))}
+    return {**lists, **of_springs, **of_anchors, **more, "ground": rng.choice((None, 0.0)), "power": 0.5}
+
+
+def _call_springs(a: Arguments):
+    lists = ops.SpringLists(*(a[name] for name in ops.SpringLists._fields))
+    out = ops.advance_springs(springs=lists, **{k: v for k, v in a.items() if k not in lists._fields})
+    numbers = [x for x in a.values() if isinstance(x, Tensor) and x.is_floating_point() and x.numel()]
+    tame = all(bool((x.abs() < 100).all()) for x in numbers) and bool((a["lengths"] > 1e-3).all()) and a["seconds"] < 1
+    return out if tame and a["power"] < 2 else [x.shape for x in out]  # too long a substep gives any numbers
+
+
 def _cameras(rng: random.Random, images: int) -> dict[str, Tensor]:
     viewmats = torch.eye(4).repeat(images, 1, 1)
     viewmats[:, :3, 3] = tensor(rng, images, 3, scale=0.1)
@@ -465,6 +484,7 @@ OPS: dict[str, tuple[Callable[[random.Random], Arguments], Callable[[Arguments],
     "join_records": (_join_records, _call_join_records),
     "norm_gelu": (_norm_gelu, lambda a: ops.norm_gelu(**a)),
     "decode_gaussians": (_decode, _call_decode),
+    "advance_springs": (_springs, _call_springs),
     "plane_sweep": (_plane_sweep, lambda a: ops.plane_sweep(**a)),
     "sweep_geometry": (_sweep_geometry, lambda a: ops.sweep_geometry(**a)),
     "rasterize_gaussians": (_raster, _call_raster),
