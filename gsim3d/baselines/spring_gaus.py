@@ -1,16 +1,18 @@
 """Spring-Gaus: an elastic object fitted to one trajectory, as a baseline of ``gsim3d evaluate``.
 
 Isotropic Gaussians are fitted to frame 0, bound to a spring-mass system, and its initial velocity, stiffness, friction
-and softness to the first frames by rendering. What is not as published: Gaussians begin in the visual hull of the masks
-instead of a box, and are not densified; a ground of flat Gaussians at a known height is fitted beside the object.
+and softness to the first frames by rendering. As published, but for the static stage: Gaussians begin in the visual
+hull of the masks with free sizes, and are not densified, in a third of the iterations; beside the object, a ground of
+flat Gaussians is fitted.
 
 Source: Zhong et al. 2024, "Reconstruction and Simulation of Elastic Objects with Spring-Mass 3D Gaussians".
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -27,9 +29,10 @@ from gsim3d.baselines.spring_mass import (
 )
 from gsim3d.cameras import Cameras
 from gsim3d.data import Scene
-from gsim3d.data.recording import FIXED, MOVING
+from gsim3d.data.recording import FIXED, MOVING, read_json
 from gsim3d.errors import InputError
 from gsim3d.evaluate.metrics import ssim
+from gsim3d.evaluate.physics import true_states
 from gsim3d.io.terminal import progress
 from gsim3d.ops import rasterize_gaussians
 
@@ -37,6 +40,7 @@ COARSE, FINE = 48, 40  # voxels along the longest side, of the bounds and of the
 GROUND = 64  # Gaussians along each side of the ground
 ADAM = {"eps": 1e-15}
 RATES = {"means": 1.6e-4, "colors": 2.5e-3, "opacities": 0.05, "scales": 5e-3}
+APPEARANCE = {name: RATES[name] for name in ("colors", "opacities", "scales")}
 LATE_MEANS = 1.6e-6  # rate of the positions in the dynamic stage
 
 
@@ -52,12 +56,12 @@ class SpringGausConfig:
     damping: float = 0.1  #: along the springs, constant; none while the velocity is fitted
     substeps: int = 100  #: of a frame; ``more_substeps`` are added at a third and two thirds of the dynamic stage
     more_substeps: int = 50  #: see above; also added where a number is not finite
-    static_iterations: int = 3000  #: of Adam on frame 0
-    refine_iterations: int = 1000  #: of appearance with bound positions, before each of the two next stages
+    static_iterations: int = 10_000  #: of Adam on frame 0
+    ground_iterations: int = 1000  #: of Adam on the ground of frame 0, from all cameras
+    refine_iterations: int = 3000  #: of appearance with bound positions, before each of the two next stages
     velocity_iterations: int = 100  #: passes through the frames before contact
     dynamic_iterations: int = 300  #: passes through all fitted frames
     hit_frame: int = 4  #: frames of the velocity stage
-    ground: float = 0.0  #: metres, height of the ground along z
     seed: int = 123  #: of anchors and cameras
 
 
@@ -86,37 +90,69 @@ class SpringGaus:
 
     def __init__(self, name: str, config: SpringGausConfig, device: str = "cpu"):
         self.name, self.folder, self.config, self.device = name, "fitted", config, torch.device(device)
+        self._last: tuple = (None, None)  # key of the last fit, and the fit
 
     def cameras(self, scene: Scene) -> tuple[int, ...]:
         """Returns every fourth camera: the others are fitted."""
         return tuple(range(0, scene.n_cams, 4))
 
     def check(self, scene: Scene, cams: Sequence[int], n_encoded: int, n_future: int) -> None:
-        """Raises InputError where the method does not apply: no labels, no ground, or more than one body."""
-        if not scene.has_segmentation():
-            raise InputError(f"{scene.path}: {self.name} is not applicable: the scene has no masks of the object")
+        """Raises InputError where the method does not apply: no labels, no flat ground, actors, or several bodies."""
         others = [cam for cam in range(scene.n_cams) if cam not in cams]
-        if len(others) < 2:
-            raise InputError(f"{scene.path}: {self.name} is not applicable: {len(others)} cameras are left to fit")
-        labels = scene.segmentation(others, [0])
-        if not (labels == FIXED).any():
-            raise InputError(f"{scene.path}: {self.name} is not applicable: there is no ground")
-        n_bodies = _count_bodies(_hull(scene, others, COARSE)[1])
-        if n_bodies != 1:
-            raise InputError(f"{scene.path}: {self.name} is not applicable: {n_bodies} bodies, and it simulates one")
+        reason = None
+        if not scene.has_segmentation():
+            reason = "the scene has no masks of the object"
+        elif len(others) < 2:
+            reason = f"{len(others)} cameras are left to fit"
+        elif scene.has_actions():
+            reason = "an actor moves the object"
+        elif _ground_height(scene) is None or not (scene.segmentation(others, [0]) == FIXED).any():
+            reason = "there is no ground"
+        else:
+            n_bodies = max(_count_bodies(_hull(scene, others, COARSE)[1]), len(true_states(scene) or []))
+            if n_bodies != 1:
+                reason = f"{n_bodies} bodies (a cloth is one), and it simulates one"
+        if reason:
+            raise InputError(f"{scene.path}: {self.name} is not applicable: {reason}")
 
     def images(self, scene: Scene, cams: list[int], n_encoded: int, n_future: int) -> Tensor:
         """Fits the scene; returns ``n_future`` steps after the first ``n_encoded``, uint8 [n_future, V, H, W, 3]."""
-        count = self.config.fit_frames
-        count = n_encoded if count is None else min(count or scene.n_steps, scene.n_steps)
-        fit = Fit(scene, [cam for cam in range(scene.n_cams) if cam not in cams], count, self.config, self.device)
-        return fit.images(cams, range(n_encoded, n_encoded + n_future)).mul(255).round().to(torch.uint8)
+        fit = self._fit(scene, cams, n_encoded)
+        return _as_bytes(fit.images(cams, range(n_encoded, n_encoded + n_future), fit.ground))
+
+    def object_images(self, scene: Scene, cams: list[int], n_encoded: int, n_future: int) -> Tensor:
+        """Returns the same images of the object alone, on black."""
+        return _as_bytes(self._fit(scene, cams, n_encoded).images(cams, range(n_encoded, n_encoded + n_future)))
+
+    def _fit(self, scene: Scene, cams: Sequence[int], n_encoded: int) -> Fit:
+        wanted = self.config.fit_frames
+        count = n_encoded if wanted is None else min(wanted or scene.n_steps, scene.n_steps)
+        others = tuple(cam for cam in range(scene.n_cams) if cam not in cams)
+        key = (scene.path, scene.width, scene.height, others, count)
+        if self._last[0] != key:
+            self._last = key, _started(scene, others, count, self.config, self.device).with_dynamics(count, self.config)
+        return self._last[1]
+
+
+_STARTED: dict = {}  # the last start: fits to more or less frames of a scene share it
+
+
+def _started(scene: Scene, cams: tuple[int, ...], count: int, config: SpringGausConfig, device: torch.device) -> Fit:
+    first = min(config.hit_frame, count)
+    key = (scene.path, scene.width, scene.height, cams, first, device, FINE, GROUND)
+    key += (replace(config, fit_frames=0, dynamic_iterations=0),)
+    if key not in _STARTED:
+        _STARTED.clear()
+        _STARTED[key] = Fit(scene, cams, first, config, device)
+    return _STARTED[key]
 
 
 class Fit:
-    """One scene, fitted when it is made.
+    """One scene, fitted to frame 0 and the velocity of the first frames when it is made; then :meth:`with_dynamics`.
 
     Attributes:
+        object, ground: Gaussians at frame 0.
+        springs: anchors and springs.
         velocity: [3] m/s at frame 0.
         stiffness: log10 of each anchor's, [N].
         losses: losses of the dynamic stage, means over a pass.
@@ -124,31 +160,42 @@ class Fit:
     """
 
     def __init__(self, scene: Scene, cams: Sequence[int], count: int, config: SpringGausConfig, device: torch.device):
-        self.scene, self.config, self.device, self.count = scene, config, device, count
-        self._generator = torch.Generator().manual_seed(config.seed)
-        self._cameras = [scene.cameras_at(cams, [step]).to(device) for step in range(count)]
-        images = scene.images(cams, range(count)).to(device).permute(0, 1, 3, 4, 2).float() / 255
-        labels = scene.segmentation(cams, range(count)).to(device)
-        self._objects = images * (labels == MOVING)[..., None]
+        self.scene, self.config, self.device, self._cams = scene, config, device, cams
+        self.height, self.substeps, self.losses = _ground_height(scene) or 0.0, config.substeps, []
+        self._load(count)
+        labels = scene.segmentation(cams, [0]).to(device)[0] != MOVING
+        images = scene.images(cams, [0]).to(device)[0].permute(0, 2, 3, 1).float() / 255
         axes, inside = _hull(scene, cams, FINE)
         points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)[inside].to(device)
         cell = float(axes[0][1] - axes[0][0])
         self.object = Splats(points, _seen_colors(points, self._cameras[0], self._objects[0]), cell / 2)
-        self.ground = self._fit_ground(images[0] * (labels[0] != MOVING)[..., None], labels[0] != MOVING)
-        self._fit_appearance(config.static_iterations, 0.2, RATES, points)
+        self.ground = self._fit_ground(images * labels[..., None], labels)
+        extent = _extent(self._cameras[0])
+        self._fit_appearance("static", config.static_iterations, 0.2, RATES | {"means": extent * RATES["means"]})
         rest = self.object.rows["means"].detach()
         options = {"n_anchors": config.anchors, "n_neighbors": config.neighbors, "edge": config.edge}
         self.springs: Springs = build_springs(rest, **options, seed=config.seed)
         self._indices, self._weights = bind(rest, self.springs.rest)
-        self._offset = rest - self._bound(self.springs.rest)
-        n, k = self.springs.neighbors.shape
+        self._start_parameters()
+        self._fit_appearance("appearance", config.refine_iterations, 0.2, APPEARANCE)
+        self._fit_velocity(rest - self._bound(self.springs.rest))
+        self.object.rows["means"] = self._bound(self.springs.rest).requires_grad_()
+        self._fit_appearance("bound appearance", config.refine_iterations, 0.05, APPEARANCE)
+
+    def _load(self, count: int) -> None:
+        """Reads the first ``count`` frames: cameras, and images of the object on black."""
+        steps = range(count)
+        self._generator = torch.Generator().manual_seed(self.config.seed)
+        self._cameras = [self.scene.cameras_at(self._cams, [step]).to(self.device) for step in steps]
+        images = self.scene.images(self._cams, steps).to(self.device).permute(0, 1, 3, 4, 2).float() / 255
+        self._objects = images * (self.scene.segmentation(self._cams, steps).to(self.device) == MOVING)[..., None]
+
+    def _start_parameters(self) -> None:
+        n, device = len(self.springs.rest), self.device
         self.velocity = torch.zeros(3, device=device, requires_grad=True)
-        self.stiffness = torch.full((n,), config.stiffness, device=device).log10().requires_grad_()
+        self.stiffness = torch.full((n,), self.config.stiffness, device=device).log10().requires_grad_()
         self._friction = torch.tensor(-1.0, device=device, requires_grad=True)
         self._softness = torch.zeros((), device=device, requires_grad=True)
-        self.losses: list[float] = []
-        self.substeps = config.substeps
-        self._fit_motion()
 
     def _bound(self, anchors: Tensor) -> Tensor:
         return (self._weights[..., None] * anchors[self._indices]).sum(1)
@@ -156,7 +203,7 @@ class Fit:
     def _loss(self, frame: int, means: Tensor, share: float) -> Tensor:
         """(1 - share) L1 + share (1 - SSIM) of one random camera."""
         camera = int(torch.randint(len(self._objects[frame]), (), generator=self._generator))
-        image = self.object.render(self._cameras[frame].select(torch.tensor([camera], device=self.device)), means)
+        image = self.object.render(self._cameras[frame].select(slice(camera, camera + 1)), means)
         target = self._objects[frame][camera : camera + 1]
         similar = ssim(image.clamp(0, 1), target).mean().float()
         return (1 - share) * (image - target).abs().mean() + share * (1 - similar)
@@ -166,86 +213,91 @@ class Fit:
         low, high = torch.from_numpy(self.scene.bounds).float()
         axes = [torch.linspace(float(low[k]), float(high[k]), GROUND) for k in range(2)]
         points = torch.cartesian_prod(*axes)
-        points = torch.cat([points, torch.full((len(points), 1), self.config.ground)], 1).to(self.device)
+        points = torch.cat([points, torch.full((len(points), 1), self.height)], 1).to(self.device)
         edge = float((high - low)[:2].max() / (GROUND - 1))
         ground = Splats(points, _seen_colors(points, self._cameras[0], images), edge / 2, opacity=2.0)
-        adam = ground.optimizer({name: RATES[name] for name in ("colors", "opacities", "scales")})
-        for _ in range(self.config.static_iterations // 3):
+        adam = ground.optimizer(APPEARANCE)
+        for _ in range(self.config.ground_iterations):
             loss = ((ground.render(self._cameras[0]) - images).abs().mean(-1) * counted).mean()
             _step(adam, loss)
         return ground
 
-    def _fit_appearance(self, iterations: int, share: float, rates: dict[str, float], means: Tensor | None = None):
-        """Adam on frame 0, with the positions too where ``means`` is None or free."""
+    def _fit_appearance(self, stage: str, iterations: int, share: float, rates: dict[str, float]) -> None:
+        """Adam on frame 0 over what has a rate; that of positions falls to LATE_MEANS / RATES["means"] of it."""
         adam = self.object.optimizer(rates)
-        decay = (LATE_MEANS / RATES["means"]) ** (1 / max(1, iterations))
-        for _ in range(iterations):
-            place = self.object.rows["means"] if "means" in rates else means
-            _step(adam, self._loss(0, place, share))
-            adam.param_groups[0]["lr"] *= decay if "means" in rates else 1.0
+        decay = (LATE_MEANS / RATES["means"]) ** (1 / max(1, iterations)) if "means" in rates else 1.0
+        with progress(None, stage, iterations, unit="step") as bar:
+            for _ in range(iterations):
+                _step(adam, self._loss(0, self.object.rows["means"], share))
+                adam.param_groups[0]["lr"] *= decay
+                bar.update()
 
-    def _fit_motion(self) -> None:
-        config, appearance = self.config, {name: RATES[name] for name in ("colors", "opacities", "scales")}
-        at_rest = self.object.rows["means"].detach()
-        self._fit_appearance(config.refine_iterations, 0.2, appearance, at_rest)
+    def _fit_velocity(self, offset: Tensor) -> None:
+        """Gaussians move from where they began, ``offset`` from the mean of their anchors."""
         adam = torch.optim.Adam([self.velocity], lr=1e-3, **ADAM)
         halve = torch.optim.lr_scheduler.StepLR(adam, 100, 0.5)
-        with progress(None, "velocity", config.velocity_iterations, unit="pass") as bar:
-            for _ in range(config.velocity_iterations):
-                self._pass(min(config.hit_frame, self.count), 0.2, adam, halve, damping=0.0, soft=False, moved=True)
+        with progress(None, "velocity", self.config.velocity_iterations, unit="pass") as bar:
+            for _ in range(self.config.velocity_iterations):
+                self._pass(0.2, adam, halve, damping=0.0, soft=False, offset=offset)
                 bar.update()
         self.velocity = self.velocity.detach()
-        bound = self._bound(self.springs.rest)
-        self._fit_appearance(config.refine_iterations, 0.05, appearance, bound)
-        parts = [self.stiffness, self._friction, self._softness]
-        adam, late = torch.optim.Adam(parts, lr=1e-3, **ADAM), self.object.optimizer(appearance)
+
+    def with_dynamics(self, count: int, config: SpringGausConfig) -> Fit:
+        """Returns a fit of stiffness, friction and softness to the first ``count`` frames; this one stays as it is."""
+        fit = copy.copy(self)
+        fit.config, fit.object, fit.losses = config, self.object.copy(), []
+        fit._load(count)
+        fit._start_parameters()
+        fit.velocity = self.velocity
+        adam = torch.optim.Adam([fit.stiffness, fit._friction, fit._softness], lr=1e-3, **ADAM)
+        late = fit.object.optimizer(APPEARANCE | {"means": LATE_MEANS})
         with progress(None, "dynamics", config.dynamic_iterations, unit="pass") as bar:
             for number in range(config.dynamic_iterations):
                 if number and number in (config.dynamic_iterations // 3, 2 * config.dynamic_iterations // 3):
-                    self.substeps += config.more_substeps
-                self.losses.append(self._pass(self.count, 0.05, adam, None, damping=config.damping))
-                _step(late, self._loss(0, bound, 0.05))
+                    fit.substeps += config.more_substeps
+                fit.losses.append(fit._pass(0.05, adam, None, damping=config.damping))
+                _step(late, fit._loss(0, fit.object.rows["means"], 0.05))
                 bar.update()
+        fit._rolled = [SpringState(self.springs.rest, torch.zeros_like(self.springs.rest))]
+        return fit
 
-    def _pass(self, count, share, adam, schedule, *, damping: float, soft: bool = True, moved: bool = False) -> float:
-        """Returns the mean loss of frames 1 to ``count - 1``, with a step of Adam each; gradients end at the frame."""
+    def _pass(self, share, adam, schedule, *, damping: float, soft: bool = True, offset: Tensor | float = 0) -> float:
+        """Returns the mean loss of all frames after the first, with a step of Adam each; gradients end at the frame."""
         state, total = SpringState(self.springs.rest, torch.zeros_like(self.springs.rest)), 0.0
         parameters = [p for group in adam.param_groups for p in group["params"]]
-        for frame in range(1, count):
+        for frame in range(1, len(self._cameras)):
             state = self._advance(frame, state, damping, soft)
-            means = self._bound(state.positions) + (self._offset if moved else 0)  # moved from where they began
-            loss = self._loss(frame, means, share)
+            loss = self._loss(frame, self._bound(state.positions) + offset, share)
             adam.zero_grad()
             loss.backward()
             torch.nn.utils.clip_grad_norm_(parameters, 1.0)
             adam.step()
             if schedule is not None:
                 schedule.step()
-            state, total = SpringState(*(part.detach() for part in state)), total + float(loss.detach())
-        return total / max(1, count - 1)
+            state, total = SpringState(*(part.detach() for part in state)), total + loss.detach()
+        return float(total) / max(1, len(self._cameras) - 1)
 
     def _advance(self, frame: int, state: SpringState, damping: float, soft: bool) -> SpringState:
-        k = self.springs.neighbors.shape[1]
+        k = self.springs.lengths.shape[1]
         factors = softness(self._softness, k) if soft else torch.ones(k, device=self.device)
         started = SpringState(state.positions, state.velocities + self.velocity)
         given = {"stiffness": 10**self.stiffness, "factors": factors, "grip": friction(self._friction)}
-        given |= {"seconds": 1 / self.scene.fps, "ground": self.config.ground, "damping": damping}
+        given |= {"seconds": 1 / self.scene.fps, "ground": self.height, "damping": damping}
         ended, self.substeps = advance_safely(
             frame, self.substeps, self.config.more_substeps, state=started, springs=self.springs, **given
         )
         return SpringState(ended.positions, ended.velocities - self.velocity)
 
     @torch.no_grad()
-    def images(self, cams: Sequence[int], steps: range) -> Tensor:
-        """Returns images [S, V, H, W, 3] in [0, 1] of object and ground at ``steps``, from any cameras."""
-        state, images = SpringState(self.springs.rest, torch.zeros_like(self.springs.rest)), []
-        for step in range(steps[-1] + 1):
-            if step:
-                state = self._advance(step, state, self.config.damping, soft=True)
-            if step in steps:
-                cameras = self.scene.cameras_at(cams, [step]).to(self.device)
-                images.append(self.object.render(cameras, self._bound(state.positions), self.ground))
-        return torch.stack(images).clamp(0, 1)
+    def images(self, cams: Sequence[int], steps: range, beside: Splats | None = None) -> Tensor:
+        """Returns images [S, V, H, W, 3] in [0, 1] of the object at ``steps``, with others ``beside`` it."""
+        while len(self._rolled) < steps.stop:
+            step, state = len(self._rolled), self._rolled[-1]
+            self._rolled.append(self._advance(step, state, self.config.damping, soft=True))
+        cameras = [self.scene.cameras_at(cams, [step]).to(self.device) for step in steps]
+        means = [self._bound(self._rolled[step].positions) for step in steps]
+        drawn = [self.object.render(*pair, beside) for pair in zip(cameras, means, strict=True)]
+        return torch.stack(drawn).clamp(0, 1)
 
 
 class Splats:
@@ -261,6 +313,12 @@ class Splats:
         start |= {"opacities": points.new_full((n,), opacity), "scales": points.new_full((n,), scale).log()}
         self.rows = {name: value.clone().requires_grad_() for name, value in start.items()}
 
+    def copy(self) -> Splats:
+        """Returns a copy, whose optimizers leave this one as it is."""
+        copied = copy.copy(self)
+        copied.rows = {name: value.detach().clone().requires_grad_() for name, value in self.rows.items()}
+        return copied
+
     def optimizer(self, rates: dict[str, float]) -> torch.optim.Adam:
         """Returns Adam over the parameters that have a rate, in their order."""
         groups = [{"params": [self.rows[name]], "lr": rate} for name, rate in rates.items()]
@@ -275,6 +333,23 @@ class Splats:
         quats = means.new_tensor([1.0, 0, 0, 0]).expand(len(means), 4)
         opacities, colors = joined["opacities"].sigmoid(), joined["colors"].sigmoid()
         return rasterize_gaussians(means, quats, scales, opacities, cameras, colors=colors).color
+
+
+def _ground_height(scene: Scene) -> float | None:
+    """Metres along z: what the generator wrote, else 0; None if it left the ground out."""
+    file = scene.path / "metadata.json"
+    height = read_json(file).get("ground_height", 0.0) if file.is_file() else 0.0
+    return None if height is None else float(height) - float(scene.world_offset[2])
+
+
+def _extent(cameras: Cameras) -> float:
+    """1.1 times the largest distance of a camera from the mean of all."""
+    centers = -(cameras.viewmats[:, :3, :3].mT @ cameras.viewmats[:, :3, 3:])[..., 0]
+    return 1.1 * float((centers - centers.mean(0)).norm(dim=1).max())
+
+
+def _as_bytes(images: Tensor) -> Tensor:
+    return images.mul(255).round().to(torch.uint8)
 
 
 def _step(adam: torch.optim.Adam, loss: Tensor) -> None:

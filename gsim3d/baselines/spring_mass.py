@@ -4,6 +4,8 @@ Source: Zhong et al. 2024, "Reconstruction and Simulation of Elastic Objects wit
 and published program differ, the program is followed.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -11,24 +13,24 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 from torch.nn import functional as F
-from torch.utils.checkpoint import checkpoint
 
 from gsim3d.errors import InputError, NumericalError
+from gsim3d.ops import SpringLists, advance_springs
 
 GRAVITY = 9.8  # m/s^2
 FIRM = 16  # nearest neighbours, whose springs are never softened
-SLACK = 1e-6  # metres of extension that count as 0
 TINY = 1e-14
 MOST_SUBSTEPS = 500
+LARGEST = 1e6  # metres and m/s of a state that is still counted as finite
 
 
 @dataclass(frozen=True)
 class Springs:
-    """Anchors at rest and the springs between them."""
+    """Anchors at rest, and springs of each to as many of the nearest other anchors; a directed graph."""
 
     rest: Tensor  #: [N, 3] metres, positions at frame 0
-    neighbors: Tensor  #: int64 [N, k], the nearest other anchors, nearest first; a directed graph
-    lengths: Tensor  #: [N, k] metres, rest lengths
+    lengths: Tensor  #: [N, k] metres, rest lengths, shortest first
+    lists: SpringLists  #: the springs of anchor 0, then those of anchor 1, ...
 
 
 class SpringState(NamedTuple):
@@ -36,6 +38,15 @@ class SpringState(NamedTuple):
 
     positions: Tensor  #: [N, 3] metres
     velocities: Tensor  #: [N, 3] m/s
+
+
+def connect(rest: Tensor, n_neighbors: int) -> Springs:
+    """Returns the springs of anchors ``rest`` [N, 3] to ``n_neighbors`` each, fewer if there are fewer anchors."""
+    n, k = len(rest), min(n_neighbors, len(rest) - 1)
+    neighbors = _distances(rest, rest).fill_diagonal_(math.inf).sort(dim=1, stable=True).indices[:, :k]
+    lengths = (rest[neighbors] - rest[:, None]).norm(dim=2)
+    offsets = k * torch.arange(n + 1, device=rest.device)
+    return Springs(rest, lengths, SpringLists.from_neighbors(neighbors.flatten(), offsets))
 
 
 def build_springs(points: Tensor, *, n_anchors: int, n_neighbors: int, edge: float, seed: int) -> Springs:
@@ -60,10 +71,12 @@ def build_springs(points: Tensor, *, n_anchors: int, n_neighbors: int, edge: flo
     if len(cells) < 2:
         raise InputError(f"build_springs: the points occupy {len(cells)} voxel of {size:g} m; give a smaller edge")
     chosen = torch.randperm(len(cells), generator=torch.Generator().manual_seed(seed))[:n_anchors].sort().values
-    rest = ((cells[chosen.to(cells.device)] + 0.5) * size).to(points.dtype)
-    distances, neighbors = torch.cdist(rest, rest).fill_diagonal_(math.inf).sort(dim=1, stable=True)
-    k = min(n_neighbors, len(rest) - 1)
-    return Springs(rest, neighbors[:, :k].contiguous(), distances[:, :k].contiguous())
+    return connect(((cells[chosen.to(cells.device)] + 0.5) * size).to(points.dtype), n_neighbors)
+
+
+def _distances(a: Tensor, b: Tensor) -> Tensor:
+    """Distances [A, B], by differences: products would lose those of neighbours far from the origin."""
+    return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
 
 
 def bind(points: Tensor, rest: Tensor, count: int = 16) -> tuple[Tensor, Tensor]:
@@ -71,7 +84,7 @@ def bind(points: Tensor, rest: Tensor, count: int = 16) -> tuple[Tensor, Tensor]
 
     Weights are proportional to ``distance ** -0.5``; points follow ``(weights[..., None] * anchors[indices]).sum(1)``.
     """
-    distances, indices = torch.cdist(points, rest).topk(min(count, len(rest)), largest=False)
+    distances, indices = _distances(points, rest).topk(min(count, len(rest)), largest=False)
     weights = 1 / (distances.sqrt() + TINY)
     return indices, weights / weights.sum(1, keepdim=True)
 
@@ -89,22 +102,6 @@ def friction(parameter: Tensor) -> Tensor:
     return (1.2 * parameter.sigmoid() - 0.1).clamp(0, 1)
 
 
-def accelerations(
-    state: SpringState, springs: Springs, stiffness: Tensor, factors: Tensor, damping: Tensor | float, power: float
-) -> Tensor:
-    """Returns the acceleration [N, 3] in m/s^2 of each anchor (mass 1) by its own springs, without gravity."""
-    apart = state.positions[springs.neighbors] - state.positions[:, None]
-    lengths = apart.square().sum(-1).clamp_min(TINY**2).sqrt()
-    along = apart / (lengths + TINY)[..., None]
-    extension = lengths - springs.lengths
-    extension = torch.where(extension.abs() < SLACK, 0.0, extension)
-    pull = stiffness[:, None] / springs.lengths * factors * extension
-    if power:
-        pull = pull * (1 + (lengths / springs.lengths - 1).abs()) ** power
-    faster = ((state.velocities[springs.neighbors] - state.velocities[:, None]) * along).sum(-1)
-    return ((pull + damping / springs.lengths * faster)[..., None] * along).sum(1)
-
-
 def advance_frame(
     state: SpringState,
     springs: Springs,
@@ -119,9 +116,7 @@ def advance_frame(
     gravity: float = GRAVITY,
     power: float = 0.5,
 ) -> SpringState:
-    """Returns the state one frame later: semi-implicit Euler, ``substeps`` times.
-
-    An anchor at or below the ground is set onto it; its vertical velocity ends, the tangential one is scaled.
+    """Returns the state one frame later, by :func:`gsim3d.ops.advance_springs`, with gradients of all tensors.
 
     Args:
         state: positions and velocities.
@@ -130,34 +125,19 @@ def advance_frame(
         factors: [k], see :func:`softness`.
         damping: of the velocity along a spring.
         grip: see :func:`friction`; applied in each substep.
-        seconds: length of the frame.
-        substeps: number of substeps.
-        ground: metres, its height along z; None: there is none.
+        seconds, substeps, ground, power: of the op.
         gravity: m/s^2 along -z.
-        power: of the strain that stiffens a spring.
-
-    Gradients:
-        state, stiffness, factors, damping and grip; each substep is computed again in the backward pass.
     """
-    h = seconds / substeps
-    down = state.positions.new_tensor([0.0, 0.0, -gravity])
-
-    def substep(x: Tensor, v: Tensor, stiffness: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
-        v = v + h * (accelerations(SpringState(x, v), springs, stiffness, factors, damping, power) + down)
-        x = x + h * v
-        if ground is not None:
-            touching = x[:, 2:] <= ground
-            v = torch.where(touching, torch.cat([grip * v[:, :2], torch.zeros_like(v[:, 2:])], 1), v)
-            x = torch.cat([x[:, :2], x[:, 2:].clamp_min(ground)], 1)
-        return x, v
-
-    x, v = state
-    for _ in range(substeps):
-        if torch.is_grad_enabled():
-            x, v = checkpoint(substep, x, v, stiffness, factors, use_reentrant=False)
-        else:
-            x, v = substep(x, v, stiffness, factors)
-    return SpringState(x, v)
+    ones = torch.ones_like(springs.rest)
+    numbers = {
+        "lengths": springs.lengths.flatten(),
+        "stiffness": (stiffness[:, None] * factors / springs.lengths).flatten(),
+        "damping": (damping / springs.lengths).flatten(),
+        "grip": grip * ones[:, 0],
+        "external": F.pad(-gravity * ones[:, :1], (2, 0)),
+    }
+    options = {"seconds": seconds, "substeps": substeps, "ground": ground, "power": power}
+    return SpringState(*advance_springs(*state, springs.lists, **numbers, **options))
 
 
 def advance_safely(frame: int, substeps: int, more: int, **given) -> tuple[SpringState, int]:
@@ -168,7 +148,7 @@ def advance_safely(frame: int, substeps: int, more: int, **given) -> tuple[Sprin
     """
     while True:
         state = advance_frame(substeps=substeps, **given)
-        if all(bool(part.isfinite().all()) for part in state):
+        if bool((torch.stack(state).abs() < LARGEST).all()):
             return state, substeps
         if substeps + more > MOST_SUBSTEPS:
             raise NumericalError(f"spring-gaus: frame {frame} is not finite with {substeps} substeps")

@@ -25,13 +25,13 @@ from torch import Tensor
 
 from gsim3d.cameras import Frames
 from gsim3d.data import Scene, make_frames
-from gsim3d.data.recording import BACKGROUND
+from gsim3d.data.recording import BACKGROUND, MOVING
 from gsim3d.dynamics import RestLog, concatenate
 from gsim3d.effects.edits import Edit
 from gsim3d.errors import FitWarning, InputError, NumericalError
 from gsim3d.evaluate.physics import measure_particles, measure_truth, true_states
 from gsim3d.evaluate.predictions import Predictions
-from gsim3d.evaluate.scoring import EXACT_PARTS, PLAIN_METRICS, SceneScores, SceneTruth
+from gsim3d.evaluate.scoring import ALONE, EXACT_PARTS, NEEDS_LABELS, PLAIN_METRICS, SceneScores, SceneTruth
 from gsim3d.io.terminal import progress
 from gsim3d.numerics.speed import draw, encode_histories
 from gsim3d.numerics.trust import MOST_LEFT_OUT, VARIANTS, rollout_with_spread
@@ -337,7 +337,17 @@ def score_scene(
             yield other.name, theirs
         yield from ((name, make()) for name, make in baselines.items() if name in methods)
 
-    return dataclasses.replace(truth.score(predicted()), digest=digest, physics=physics)
+    scores = truth.score(predicted())
+    alone = [
+        (f"{other.name}{ALONE}", other.object_images(scene, cams, n_given, n_future).to(device).float() / 255)
+        for other in others
+        if hasattr(other, "object_images")
+    ]
+    if alone:  # against the object on black
+        objects, own = images * (labels == MOVING)[..., None], [m for m in metrics if m not in (*NEEDS_LABELS, "fvd")]
+        truth = SceneTruth(scene.name, objects, labels, valid, n_encoded, own)
+        scores.values.update(truth.score(alone).values)
+    return dataclasses.replace(scores, digest=digest, physics=physics)
 
 
 def _physics(scene: Scene, prediction: Prediction, steps: range) -> dict[str, dict[str, Tensor]]:

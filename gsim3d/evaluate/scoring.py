@@ -41,6 +41,7 @@ PLAIN_METRICS = tuple(name for name, metric in METRICS.items() if metric.weights
 NEEDS_LABELS = ("psnr_masked", "psnr_body", "psnr_ground", "psnr_ring")
 # Baselines: images of "constant" with true pixels where the label is the given one.
 EXACT_PARTS = {"perfect_ground": FIXED, "perfect_body": MOVING}
+ALONE = "-object"  # ending of the name of a method whose object alone is compared, on black
 RING_WIDTH = 0.3  # in diameters of the body
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from gsim3d.evaluate.compare import LEAST, paired
 from gsim3d.evaluate.pictures import pyplot, save_figure, write_curves
 from gsim3d.evaluate.report import facts, notes, physics_table, summarize, write_json
-from gsim3d.evaluate.scoring import METRICS, measurable
+from gsim3d.evaluate.scoring import ALONE, METRICS, measurable
 from gsim3d.io.files import with_parents, write_whole
 from gsim3d.reproduce.cells import from_json
 from gsim3d.reproduce.entries import CAMERAS, EDITS, HISTORY, MAIN, METHODS, SPEED, TRAINED
@@ -104,13 +104,19 @@ def _lines(rows: Sequence[Row], table: str) -> list[Line]:
     """Lines of one table and world, with differences to the first."""
     models = list(dict.fromkeys(row.model for row in rows))
     known = sorted((row for row in rows if row.cells), key=lambda row: models.index(row.model))
-    found = [_line(row) for row in known]
+    found = [_line(row, method) for row in known for method in _fitted(row) or [""]]
     if known and table == MAIN and known[0].model:
         found[1:1] = [_line(known[0], method) for method in METHODS]
     for line in found if table != SPEED else ():
         first = next(other for other in found if table == MAIN or other.row.model == line.row.model)
         line.against = None if line is first else _difference(line, first.by_scene)
     return found
+
+
+def _fitted(row: Row) -> list[str]:
+    """The methods in a cell of a row that is fitted to each scene."""
+    scores = next(iter(row.cells.values()))["result"].get("scores")
+    return [name for name in scores["values"] if name not in METHODS] if scores and not row.model else []
 
 
 def _line(row: Row, method: str = "") -> Line:
@@ -130,10 +136,10 @@ def _numbers(cells: dict[str, dict], method: str) -> tuple[dict, dict, dict]:
     if "scores" not in first:
         return first["numbers"], first.get("by_scene", {"": first["numbers"].get("step_ms")}), {}
     own = {scene: result["scores"] for scene, result in results.items()}
-    fitted = next((name for name in first["scores"]["values"] if name not in METHODS), "")
-    summary = summarize([from_json({**scores, "scene": scene}, method or fitted) for scene, scores in own.items()])
+    summary = summarize([from_json({**scores, "scene": scene}, method or "model") for scene, scores in own.items()])
     head = "psnr_masked" if "future.psnr_masked" in summary else "psnr"
     by_scene = {scene: scores.get(f"future.{head}") for scene, scores in summary["scenes"].items()}
+    by_scene = {} if method.endswith(ALONE) else by_scene  # the others are of whole images
     return {key: summary[key] for key in COLUMNS if summary.get(key) is not None}, by_scene, summary
 
 
@@ -219,7 +225,7 @@ def _figures(folder: Path, table: str, world: str, lines: Sequence[Line]) -> lis
         return [curves]
     file = folder / f"accuracy-against-time-{world}.png"
     figure, axes = pyplot().subplots(figsize=(6, 4), layout="constrained")
-    for k, line in enumerate(lines):
+    for k, line in enumerate(line for line in lines if line.by_scene):
         value, seconds = line.numbers.get("future.psnr_masked", line.numbers.get("future.psnr")), _seconds(line)
         if seconds is None:  # a baseline without a time of its own
             axes.axhline(value, color=f"C{k}", linestyle="--", linewidth=1, label=line.label)

@@ -16,7 +16,7 @@ from gsim3d.synth import generate
 TARGETS = [2, 4, 6, 7, 8, 10, 11]
 QUICK = SpringGausConfig(
     fit_frames=4, anchors=64, neighbors=8, edge=0.05, substeps=5, more_substeps=5, static_iterations=24,
-    refine_iterations=2, velocity_iterations=2, dynamic_iterations=2,
+    ground_iterations=8, refine_iterations=2, velocity_iterations=2, dynamic_iterations=2,
 )  # fmt: skip
 
 
@@ -43,9 +43,12 @@ def quick(monkeypatch):
 def test_a_fit_falls_as_the_body_does(data, quick):
     scene = Scene.open(find_scenes(data)[0])
     cams = [cam for cam in range(scene.n_cams) if cam in (0, 3, 5, 9)]
-    made = [spring_gaus.Fit(scene, cams, 4, QUICK, torch.device("cpu")) for _ in range(2)]
-    images = [fit.images([2], range(8)) for fit in made]
-    assert torch.equal(*images)
+    started = [spring_gaus.Fit(scene, cams, 4, QUICK, torch.device("cpu")) for _ in range(2)]
+    given = dataclasses.replace(QUICK, dynamic_iterations=0)
+    assert started[1].with_dynamics(4, given).losses == []
+    made = [start.with_dynamics(4, QUICK) for start in started]  # once after another fit from the same start
+    images = [fit.images([2], range(8), fit.ground) for fit in made]
+    assert torch.equal(*images) and torch.equal(images[0], made[0].images([2], range(8), made[0].ground))
     truth = scene.images([2], range(8)).permute(0, 1, 3, 4, 2) / 255
     errors = (images[0] - truth).square().mean((1, 2, 3, 4))
     held = (images[0][:1] - truth).square().mean((1, 2, 3, 4))
@@ -59,7 +62,8 @@ def test_evaluate_scores_baselines_without_a_checkpoint(data, quick, tmp_path):
     evaluate(Job(data=str(data), baselines=["spring-gaus"], out=str(out), **given))
     report = json.loads(out.read_text())
     assert report["not_applicable"] == {} and "spring-gaus" in report["predictions"]
-    assert report["spring-gaus.future.psnr"] > 18
+    assert report["spring-gaus.future.psnr"] > 18 and report["spring-gaus-object.future.psnr"] > 12
+    assert "spring-gaus-object.future.psnr_body" not in report
 
 
 def test_where_it_does_not_apply_it_says_why(data, quick, tmp_path, monkeypatch, capsys):
@@ -68,14 +72,15 @@ def test_where_it_does_not_apply_it_says_why(data, quick, tmp_path, monkeypatch,
     scene, method = Scene.open(find_scenes(data)[0]), baseline("spring-gaus")
     with pytest.raises(InputError, match="0 cameras are left"):
         method.check(scene, list(range(scene.n_cams)), 4, 4)
-    monkeypatch.setattr(spring_gaus, "_count_bodies", lambda inside: 2)
-    with pytest.raises(InputError, match="2 bodies, and it simulates one"):
-        method.check(scene, [2], 4, 4)
+    for name, found in (("true_states", [0, 1, 2]), ("_count_bodies", 4)):
+        monkeypatch.setattr(spring_gaus, name, lambda scene, found=found: found)
+        with pytest.raises(InputError, match=r"[34] bodies \(a cloth is one\), and it simulates one"):
+            method.check(scene, [2], 4, 4)
     out = tmp_path / "metrics.json"
     job = Job(data=str(data), baselines=["spring-gaus"], given=4, steps=4, cameras=TARGETS, scenes="all", out=str(out))
     evaluate(job)
-    assert "2 bodies" in json.loads(out.read_text())["not_applicable"]["spring-gaus"]
-    assert "2 bodies" in capsys.readouterr().out
+    assert "4 bodies" in json.loads(out.read_text())["not_applicable"]["spring-gaus"]
+    assert "4 bodies" in capsys.readouterr().out
 
 
 def test_bodies_are_counted():

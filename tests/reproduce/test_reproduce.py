@@ -149,7 +149,7 @@ def test_training(work, tmp_path, monkeypatch, no_curves):
 
 
 def test_fitted_methods_are_rows(work, tmp_path, monkeypatch, no_curves):
-    few = {"anchors": 64, "neighbors": 8, "edge": 0.05, "substeps": 5, "static_iterations": 24}
+    few = {"anchors": 64, "neighbors": 8, "edge": 0.05, "substeps": 5, "static_iterations": 24, "ground_iterations": 8}
     few |= {"refine_iterations": 2, "velocity_iterations": 2, "dynamic_iterations": 2}
     monkeypatch.setitem(BASELINES, "spring-gaus", dataclasses.replace(BASELINES["spring-gaus"], **few))
     fitted = [dataclasses.replace(entry, device=None) for entry in ENTRIES[:2]]
@@ -158,6 +158,8 @@ def test_fitted_methods_are_rows(work, tmp_path, monkeypatch, no_curves):
     row = lines[MAIN, "spring-gaus"]
     assert row["numbers"]["future.psnr_masked"] > 10 and row["seed"] is None
     assert row["numbers"].keys() <= lines[MAIN, "copy"]["numbers"].keys()
+    alone = lines[MAIN, "spring-gaus-object"]
+    assert {"future.psnr", "future.ssim"} == alone["numbers"].keys() and not alone["by_scene"]
 
 
 @pytest.mark.parametrize(
