@@ -58,11 +58,11 @@ class Cameras(TensorRecord):
     def __len__(self) -> int:
         return self.viewmats.shape[0]
 
-    def select(self, images: Tensor, image_cloud: Tensor | None = None) -> Cameras:
+    def select(self, images: Tensor | slice, image_cloud: Tensor | None = None) -> Cameras:
         """Returns a subset of the cameras.
 
         Args:
-            images: int64, indices of the cameras.
+            images: int64, indices of the cameras, or a slice of them.
             image_cloud: int64, clouds that they show. Default: unchanged.
         """
         chosen = self.map(lambda values: values[images])
