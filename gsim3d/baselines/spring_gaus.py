@@ -32,7 +32,6 @@ from gsim3d.data import Scene
 from gsim3d.data.recording import FIXED, MOVING, read_json
 from gsim3d.errors import InputError
 from gsim3d.evaluate.metrics import ssim
-from gsim3d.evaluate.physics import true_states
 from gsim3d.io.terminal import progress
 from gsim3d.ops import rasterize_gaussians
 
@@ -109,7 +108,8 @@ class SpringGaus:
         elif _ground_height(scene) is None or not (scene.segmentation(others, [0]) == FIXED).any():
             reason = "there is no ground"
         else:
-            n_bodies = max(_count_bodies(_hull(scene, others, COARSE)[1]), len(true_states(scene) or []))
+            facts, seen = _facts(scene), _count_bodies(_hull(scene, others, COARSE)[1])
+            n_bodies = max(seen, len(facts.get("bodies", [])) + ("cloth" in str(facts.get("world"))))
             if n_bodies != 1:
                 reason = f"{n_bodies} bodies (a cloth is one), and it simulates one"
         if reason:
@@ -335,10 +335,15 @@ class Splats:
         return rasterize_gaussians(means, quats, scales, opacities, cameras, colors=colors).color
 
 
+def _facts(scene: Scene) -> dict:
+    """What the generator wrote about a scene; of other scenes nothing that is asked for."""
+    file = scene.path / "metadata.json"
+    return read_json(file) if file.is_file() else {}
+
+
 def _ground_height(scene: Scene) -> float | None:
     """Metres along z: what the generator wrote, else 0; None if it left the ground out."""
-    file = scene.path / "metadata.json"
-    height = read_json(file).get("ground_height", 0.0) if file.is_file() else 0.0
+    height = _facts(scene).get("ground_height", 0.0)
     return None if height is None else float(height) - float(scene.world_offset[2])
 
 

@@ -72,7 +72,7 @@ def test_where_it_does_not_apply_it_says_why(data, quick, tmp_path, monkeypatch,
     scene, method = Scene.open(find_scenes(data)[0]), baseline("spring-gaus")
     with pytest.raises(InputError, match="0 cameras are left"):
         method.check(scene, list(range(scene.n_cams)), 4, 4)
-    for name, found in (("true_states", [0, 1, 2]), ("_count_bodies", 4)):
+    for name, found in (("_facts", {"world": "cloth", "bodies": [0, 1]}), ("_count_bodies", 4)):
         monkeypatch.setattr(spring_gaus, name, lambda scene, found=found: found)
         with pytest.raises(InputError, match=r"[34] bodies \(a cloth is one\), and it simulates one"):
             method.check(scene, [2], 4, 4)
