@@ -96,6 +96,13 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
     return f"; did you mean {lower[near[0]]}?" if near else ""
 
 
+def check_one_of(name: str, value: object, known: Iterable[str]) -> None:
+    """Raises InputError if ``value`` is not one of ``known``; the message names it, all of them, and the closest."""
+    if not isinstance(value, str) or value not in known:
+        got = f"got {repr(value)[:100]}{did_you_mean(value, known)}"
+        raise InputError(f"{name} must be one of {', '.join(known)}; {got}")
+
+
 def check_ranges(config: Any, **ranges: tuple[float, float]) -> None:
     """Raises InputError if an attribute of ``config``, a number or tuple of numbers, is outside of its (min, max)."""
     for name, (least, most) in ranges.items():
@@ -123,7 +130,5 @@ def check_processor(cpuinfo: Path = Path("/proc/cpuinfo")) -> None:
     except OSError:
         return
     if flags is not None and (missing := sorted(X86_64_V3.difference(flags))):
-        raise ProcessorError(
-            "gsim3d needs an x86-64-v3 processor (Intel Haswell, AMD Zen or later); "
-            f"this one lacks {', '.join(missing)}"
-        )
+        needed = "gsim3d needs an x86-64-v3 processor (Intel Haswell, AMD Zen or later)"
+        raise ProcessorError(f"{needed}; this one lacks {', '.join(missing)}")

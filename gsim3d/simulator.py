@@ -144,8 +144,7 @@ class Simulator(nn.Module):
             cameras: cameras to render at every step. Default: no rendering.
             background: [3] or [I, 3], background colour. Default: black.
             edits: edits to apply during the rollout.
-            wrap: see :meth:`rollout`.
-            log: see :meth:`rollout`.
+            wrap, log: see :meth:`rollout`.
 
         Returns:
             Particles of the steps after the last input step, and their images.
@@ -230,8 +229,7 @@ class Simulator(nn.Module):
             plan: plan of the effects. Default: that of :meth:`plan`. Particles are never put to sleep, because that is
                 decided along a rollout.
             generator: random generator for training (drop path, curve shuffling). Default: no randomness.
-            on_invalid: policy for invalid numbers. Default: the model's.
-            report: counts invalid numbers. Default: ``self.report``.
+            on_invalid, report: see :meth:`encode`.
 
         Returns:
             The last steps of every scene, including the new one.
@@ -270,9 +268,7 @@ class Simulator(nn.Module):
             plan: see :meth:`step`.
             plans: one plan per scene, instead of ``plan``. Scenes with equal plans are batched; each result equals that
                 of the scene alone.
-            generator: see :meth:`step`.
-            on_invalid: policy for invalid numbers. Default: the model's.
-            report: counts invalid numbers. Default: ``self.report``.
+            generator, on_invalid, report: see :meth:`step`.
             geometry: function history -> geometry of a call of the dynamics. Default: ``dynamics.geometry``.
             wrap: decorator of the function history -> next steps. Default: none.
             log: records which particles were at rest and skipped.
@@ -391,8 +387,7 @@ class Simulator(nn.Module):
             plans: one plan per scene, instead of ``plan``, all with the same outputs.
             active: bool [I, H, W], pixels that are wanted, see :func:`gsim3d.ops.rasterize_gaussians`. Default: all.
             cutoff: see :func:`gsim3d.ops.rasterize_gaussians`.
-            on_invalid: policy for invalid numbers. Default: the model's.
-            report: counts invalid numbers. Default: ``self.report``.
+            on_invalid, report: see :meth:`encode`.
 
         Returns:
             The outputs selected by the plan.

@@ -422,12 +422,8 @@ class Particles(TensorRecord):
         """Returns the particles of ``clouds``, which must ascend."""
         chosen = clouds.tolist() if isinstance(clouds, Tensor) else list(clouds)
         table, runs = self.clouds, self.clouds.row_runs(chosen)
-        table = CloudTable.make(
-            (table.count(q) for q in chosen),
-            (table.scenes[q] for q in chosen),
-            (table.steps[q] for q in chosen),
-            self.cu_rows.device,
-        )
+        counts, scenes, steps = ([of[q] for q in chosen] for of in (table.counts, table.scenes, table.steps))
+        table = CloudTable.make(counts, scenes, steps, self.cu_rows.device)
         return self.with_clouds(table, **{name: take_runs(x, runs) for name, x in self.row_fields().items()})
 
 
@@ -439,10 +435,8 @@ def newest_clouds(clouds: CloudTable) -> list[int]:
 def _newest(scenes: Sequence[int], steps: Sequence[int]) -> list[int]:
     keys = list(zip(scenes, steps))
     if any(b <= a for a, b in zip(keys, keys[1:])):
-        raise ValueError(
-            "particles: clouds must be sorted by (scene, step), without duplicates; "
-            f"got scenes {list(scenes)}, steps {list(steps)}"
-        )
+        wanted, got = "sorted by (scene, step), without duplicates", f"scenes {list(scenes)}, steps {list(steps)}"
+        raise ValueError(f"particles: clouds must be {wanted}; got {got}")
     return [q for q in range(len(scenes)) if q + 1 == len(scenes) or scenes[q + 1] != scenes[q]]
 
 
@@ -512,12 +506,9 @@ def concatenate(parts: Sequence[Particles], max_steps: int | None = None) -> Par
     if max_steps is not None:
         scenes, steps = [cloud[0] for cloud in clouds], [cloud[1] for cloud in clouds]
         clouds = [clouds[i] for i in _last(scenes, steps, max_steps)]
-    table = CloudTable.make(
-        (tables[p].count(q) for _, _, p, q in clouds),
-        (scene for scene, *_ in clouds),
-        (step for _, step, *_ in clouds),
-        parts[0].cu_rows.device,
-    )
+    counts = [tables[p].count(q) for *_, p, q in clouds]
+    scenes, steps = ([cloud[i] for cloud in clouds] for i in (0, 1))
+    table = CloudTable.make(counts, scenes, steps, parts[0].cu_rows.device)
     taken = [sorted(q for *_, part, q in clouds if part == p) for p in range(len(parts))]
     runs = [[own.row_runs([q])[0] for q in chosen] for own, chosen in zip(tables, taken, strict=True)]
     order = {key: i for i, key in enumerate((p, q) for p, chosen in enumerate(taken) for q in chosen)}

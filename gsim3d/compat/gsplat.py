@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.cameras import Cameras
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, check_one_of
 from gsim3d.ops.projection import Projection, project_gaussians, sh_to_color
 from gsim3d.ops.raster import Rendering
 from gsim3d.ops.raster_projected import rasterize_projected
@@ -190,8 +190,7 @@ def _refuse(offered: dict[str, Any], choices: dict[str, tuple[str, Sequence[str]
         if value is not None and value is not False:
             raise InputError(f"rasterization: {name} is not offered; leave it at its default")
     for name, (value, known) in choices.items():
-        if value not in known:
-            raise InputError(f"rasterization: {name} must be one of {', '.join(known)}; got {value!r}")
+        check_one_of(f"rasterization: {name}", value, known)
 
 
 def _check(batch, n, n_cameras, means, quats, scales, covars, opacities, viewmats, Ks) -> None:

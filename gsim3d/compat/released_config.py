@@ -49,21 +49,13 @@ OF_ANOTHER = "this configuration belongs to another checkpoint"
 
 @dataclass(frozen=True)
 class ReleasedConfig:
-    """Converted configuration of a published checkpoint.
+    """Converted configuration of a published checkpoint."""
 
-    Attributes:
-        model: model configuration.
-        data: data section of a checkpoint's config.yaml.
-        effects: effects that the model was trained to simulate.
-        notes: remarks for the user.
-        ignored: keys of the file without effect in gsim3d.
-    """
-
-    model: ReleasedModelConfig
-    data: dict[str, Any]
-    effects: EffectsSpec
-    notes: tuple[str, ...]
-    ignored: tuple[str, ...]
+    model: ReleasedModelConfig  #: model configuration
+    data: dict[str, Any]  #: data section of a checkpoint's config.yaml
+    effects: EffectsSpec  #: effects that the model was trained to simulate
+    notes: tuple[str, ...]  #: remarks for the user
+    ignored: tuple[str, ...]  #: keys of the file without effect in gsim3d
 
 
 class _Settings:
@@ -87,44 +79,40 @@ class _Settings:
             value = value[key]
         return value
 
-    def _check(self, good: bool, path: str, what: str, value: Any) -> None:
+    def _checked(self, value: Any, good: bool, path: str, what: str) -> Any:
         if not good:
             raise InputError(f"{path}: must be {what}; got {shown(value)}")
+        return value
 
     def number(self, path: str, default: Any = NO_MEANING) -> float:
         value = self.get(path, default)
         if isinstance(value, str) and re.fullmatch(r"-?\d+[eE][-+]?\d+", value):  # YAML 1.1 reads 4e-3 as text
             value = float(value)
-        self._check(type(value) in (int, float) and math.isfinite(value), path, "a number", value)
-        return float(value)
+        good = type(value) in (int, float) and math.isfinite(value)
+        return float(self._checked(value, good, path, "a number"))
 
     def positive(self, path: str) -> float:
         value = self.number(path)
-        self._check(value > 0, path, "above 0", value)
-        return value
+        return self._checked(value, value > 0, path, "above 0")
 
     def whole(self, path: str, default: Any = NO_MEANING) -> int:
         value = self.get(path, default)
-        self._check(type(value) is int, path, "an integer", value)
-        return value
+        return self._checked(value, type(value) is int, path, "an integer")
 
     def flag(self, path: str, default: Any = NO_MEANING) -> bool:
         value = self.get(path, default)
-        self._check(isinstance(value, bool), path, "true or false", value)
-        return value
+        return self._checked(value, isinstance(value, bool), path, "true or false")
 
     def wholes(self, path: str, count: int | None = None) -> tuple[int, ...]:
         value = self.get(path)
         good = isinstance(value, list) and all(type(n) is int and 0 < n < 2**20 for n in value)
         good = good and count in (None, len(value))
-        self._check(good, path, f"a list of {count or 'any number of'} integers", value)
-        return tuple(value)
+        return tuple(self._checked(value, good, path, f"a list of {count or 'any number of'} integers"))
 
     def names(self, path: str) -> set[str]:
         value = self.get(path)
         good = isinstance(value, list) and all(isinstance(name, str) for name in value)
-        self._check(good, path, "a list of names", value)
-        return set(value)
+        return set(self._checked(value, good, path, "a list of names"))
 
     def unread(self) -> list[str]:
         """Returns the dotted paths of values, or of whole mappings, that were not read."""
@@ -169,15 +157,8 @@ class _Sizes:
 
 
 def read_config(content: dict, shapes: Shapes) -> ReleasedConfig:
-    """Converts the settings of a published run.
-
-    Args:
-        content: content of the YAML file.
-        shapes: published name -> shape of the weights.
-
-    Raises:
-        InputError: a setting is missing, of the wrong type or not supported; the message names it.
-    """
+    """Converts the settings of a published run, the content of its YAML file; ``shapes``: published name -> shape of
+    the weights. Raises InputError, which names it, if a setting is missing, of the wrong type or not supported."""
     settings = _Settings(content)
     sizes = _Sizes(shapes, settings)
     for section, values in FIXED.items():

@@ -37,13 +37,10 @@ _PLACEHOLDER_PACKAGES = {
     "pytorch_lightning", "lightning", "lightning_fabric", "lightning_utilities", "omegaconf", "numpy", "pathlib",
     "typing", "argparse", "datetime",
 }  # fmt: skip
-_PLACEHOLDER_NAMES = {
-    "collections.defaultdict", "collections.Counter", "collections.deque", "_codecs.encode",
-    "builtins.set", "builtins.frozenset", "builtins.dict", "builtins.list", "builtins.tuple", "builtins.int",
-    "builtins.long", "builtins.float", "builtins.complex", "builtins.str", "builtins.unicode", "builtins.bytes",
-    "builtins.bytearray", "builtins.bool", "builtins.slice",
-    "torch.Size", "torch.device", "torch.Generator", "torch.float32", "torch.float64", "torch.float16",
-    "torch.bfloat16", "torch.int64", "torch.int32",
+_PLACEHOLDERS = {
+    "collections": "defaultdict Counter deque", "_codecs": "encode",
+    "builtins": "set frozenset dict list tuple int long float complex str unicode bytes bytearray bool slice",
+    "torch": "Size device Generator float32 float64 float16 bfloat16 int64 int32",
 }  # fmt: skip
 
 
@@ -96,7 +93,8 @@ class _Unpickler(pickle.Unpickler):
         full = f"{module}.{name}".replace("__builtin__.", "builtins.")  # torch.save writes Python 2's names
         if full in _KNOWN:
             return _KNOWN[full]
-        if full in _PLACEHOLDER_NAMES or module.split(".")[0] in _PLACEHOLDER_PACKAGES:
+        module, _, name = full.rpartition(".")
+        if name in _PLACEHOLDERS.get(module, "").split() or module.split(".")[0] in _PLACEHOLDER_PACKAGES:
             return Ignored
         said = f"it references {full}, which is not part of a checkpoint's weights and could run code"
         advice = "do not load this file with other programs either, unless you trust its source"

@@ -24,17 +24,11 @@ MAX_NAMED = 8  # tensors listed in a message
 
 @dataclass(frozen=True)
 class UntrainedSigns:
-    """Result of :func:`untrained_signs`.
+    """Result of :func:`untrained_signs`."""
 
-    Attributes:
-        blocks: number of attention and MLP blocks of the dynamics whose weights look untrained.
-        n_blocks: number of all blocks.
-        latent_heads: whether the encoder's latent heads and their conditioning look untrained; None without heads.
-    """
-
-    blocks: int
-    n_blocks: int
-    latent_heads: bool | None
+    blocks: int  #: number of attention and MLP blocks of the dynamics whose weights look untrained
+    n_blocks: int  #: number of all blocks
+    latent_heads: bool | None  #: whether latent heads and their conditioning look untrained; None without heads
 
     def sentence(self) -> str:
         if self.blocks == 0 and not self.latent_heads:
@@ -48,32 +42,19 @@ class UntrainedSigns:
 
 @dataclass(frozen=True)
 class Imported:
-    """A converted published checkpoint.
+    """A converted published checkpoint."""
 
-    Attributes:
-        config: converted configuration.
-        weights: state dict of :class:`gsim3d.Simulator`.
-        n_parameters: number of published parameters.
-        ignored: names of tensors that the model does not have.
-        counts: epoch and global_step, if stored.
-        signs: untrained parts.
-    """
-
-    config: ReleasedConfig
-    weights: dict[str, Tensor]
-    n_parameters: int
-    ignored: tuple[str, ...]
-    counts: dict[str, int]
-    signs: UntrainedSigns
+    config: ReleasedConfig  #: converted configuration
+    weights: dict[str, Tensor]  #: state dict of :class:`gsim3d.Simulator`
+    n_parameters: int  #: number of published parameters
+    ignored: tuple[str, ...]  #: names of tensors that the model does not have
+    counts: dict[str, int]  #: epoch and global_step, if stored
+    signs: UntrainedSigns  #: untrained parts
 
 
 def import_released(path: str | Path, settings: dict) -> Imported:
-    """Reads and converts a published checkpoint with the settings of its resolved YAML file.
-
-    Raises:
-        InputError: the file is of another kind or could run code, a setting is not supported, or tensors are missing or
-            of the wrong shape; the message names them.
-    """
+    """Reads and converts a published checkpoint with the settings of its resolved YAML file. Raises InputError if the
+    file is of another kind or could run code, a setting is not supported, or tensors are missing or misshapen."""
     with ReleasedFile(path) as file:
         stored, counts = state_dict(file)
         shapes = {name: tensor.shape for name, tensor in stored.items()}
@@ -141,16 +122,8 @@ def _drawn_layer(published: dict[str, Tensor], prefix: str) -> bool:
 
 
 def write_imported(source: str | Path, settings_file: str | Path, out: str | Path) -> str:
-    """Imports a published checkpoint into the checkpoint folder ``out``; returns a report.
-
-    Args:
-        source: checkpoint of the authors' release (.ckpt).
-        settings_file: its resolved configuration (.yaml).
-        out: folder to write; must not exist.
-
-    Raises:
-        InputError: a file is not of the release, or tensors and settings do not match.
-    """
+    """Imports a checkpoint of the authors' release (.ckpt) with its resolved configuration (.yaml) into the new
+    checkpoint folder ``out``; returns a report. Raises InputError if a file is not of the release, or both differ."""
     out, source, settings = new_output_path(out), Path(source), read_yaml(settings_file)
     try:
         imported = import_released(source, settings)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from gsim3d.errors import InputError, check_ranges
+from gsim3d.errors import InputError, check_one_of, check_ranges
 from gsim3d.nn.graph_network import MAX_HISTORY_BITS, GraphConfig, graph_spec
 from gsim3d.nn.point_transformer import TransformerConfig
 from gsim3d.ops.curve import PyramidSpec
@@ -17,53 +17,39 @@ BACKGROUNDS = ("symmetric", "asymmetric", "relightable")
 
 @dataclass(frozen=True, kw_only=True)
 class DynamicsConfig(TransformerConfig):
-    """Configuration of the dynamics: its network, outputs, priors and background, on top of the transformer's.
+    """Configuration of the dynamics: its network, outputs, priors and background, on top of the transformer's."""
 
-    Attributes:
-        graph: the network is a graph network of this size, which reads no settings of levels, patches and blocks;
-            None: the point transformer.
-        dynamic_latents: channels of ``Particles.dynamic_latents``.
-        static_latents: channels of ``Particles.static_latents``.
-        explicit: particles carry Gaussian parameters (quats, scales, sh), which the network changes.
-        sh_degree: degree of the spherical harmonics of explicit particles.
-        scale_min: smallest scale of explicit particles in metres.
-        scale_max: largest scale of explicit particles in metres.
-        predicts: "from_newest": the change from the newest state of the history to each later state; "from_previous":
-            the change from the previous state; "absolute": the state itself.
-        steps_per_call: steps that one call of the network predicts.
-        max_step: largest displacement in a step along each axis in metres; None: unlimited, as changes of scales.
-        max_latent_step: largest change of each dynamic latent in a step; None: unlimited.
-        position_features: adds positions relative to the scene's origin and inside the cell to the network's input.
-            Without them the motion is translation-invariant, and learning the height of the ground takes more data.
-        position_length: unit of the relative positions in metres.
-        priors: hand-made physics in order of application (:mod:`gsim3d.priors`).
-        background: "symmetric": the network treats frozen particles as all others, and changes their latents;
-            "asymmetric": frozen particles attend only to each other, never change, and are computed once a rollout,
-            and moving particles attend to both (:mod:`gsim3d.dynamics.frozen_context`); "relightable": the network
-            reads frozen particles in the newest step only, with their initial latents, and predicts changes from these,
-            so that errors of shadows do not accumulate; bodies with changing latents are treated the same way. The
-            weights have the same shapes for all three; use the same value for training and simulation.
-        shuffle_orders: shuffles the four curves of each level in training.
-        actions: types of points of actors, each with a learned embedding (:mod:`gsim3d.dynamics.actions`). Empty: the
-            model has no action particles.
-    """
-
+    #: the network is a graph network of this size, which reads no settings of levels, patches and blocks; None: the
+    #: point transformer
     graph: GraphConfig | None = None
-    dynamic_latents: int = 32
-    static_latents: int = 32
-    explicit: bool = False
-    sh_degree: int = 3
-    scale_min: float = 0.0002
-    scale_max: float = 0.1
+    dynamic_latents: int = 32  #: channels of ``Particles.dynamic_latents``
+    static_latents: int = 32  #: channels of ``Particles.static_latents``
+    explicit: bool = False  #: particles carry Gaussian parameters (quats, scales, sh), which the network changes
+    sh_degree: int = 3  #: degree of the spherical harmonics of explicit particles
+    scale_min: float = 0.0002  #: smallest scale of explicit particles in metres
+    scale_max: float = 0.1  #: largest scale of explicit particles in metres
+    #: "from_newest": the change from the newest state of the history to each later state; "from_previous": the change
+    #: from the previous state; "absolute": the state itself
     predicts: str = "from_newest"
-    steps_per_call: int = 1
+    steps_per_call: int = 1  #: steps that one call of the network predicts
+    #: largest displacement in a step along each axis in metres; None: unlimited, as changes of scales
     max_step: float | None = 0.5
-    max_latent_step: float | None = None
+    max_latent_step: float | None = None  #: largest change of each dynamic latent in a step; None: unlimited
+    #: adds positions relative to the scene's origin and inside the cell to the network's input. Without them the motion
+    #: is translation-invariant, and learning the height of the ground takes more data.
     position_features: bool = False
-    position_length: float = 1.0
-    priors: tuple[PriorConfig, ...] = ()
+    position_length: float = 1.0  #: unit of the relative positions in metres
+    priors: tuple[PriorConfig, ...] = ()  #: hand-made physics in order of application (:mod:`gsim3d.priors`)
+    #: "symmetric": the network treats frozen particles as all others, and changes their latents; "asymmetric": frozen
+    #: particles attend only to each other, never change, and are computed once a rollout, and moving particles attend
+    #: to both (:mod:`gsim3d.dynamics.frozen_context`); "relightable": the network reads frozen particles in the newest
+    #: step only, with their initial latents, and predicts changes from these, so that errors of shadows do not
+    #: accumulate; bodies with changing latents are treated the same way. The weights have the same shapes for all
+    #: three; use the same value for training and simulation.
     background: str = "symmetric"
-    shuffle_orders: bool = True
+    shuffle_orders: bool = True  #: shuffles the four curves of each level in training
+    #: types of points of actors, each with a learned embedding (:mod:`gsim3d.dynamics.actions`). Empty: the model has
+    #: no action particles.
     actions: tuple[str, ...] = ()
 
     max_opacity: ClassVar[float] = 1.0  # largest opacity of a particle
@@ -71,11 +57,8 @@ class DynamicsConfig(TransformerConfig):
 
     def __post_init__(self):
         super().__post_init__()
-        if self.predicts not in PREDICTS:
-            raise ValueError(f"DynamicsConfig: predicts must be one of {', '.join(PREDICTS)}; got {self.predicts!r}")
-        if self.background not in BACKGROUNDS:
-            known = ", ".join(BACKGROUNDS)
-            raise ValueError(f"DynamicsConfig: background must be one of {known}; got {self.background!r}")
+        check_one_of("DynamicsConfig: predicts", self.predicts, PREDICTS)
+        check_one_of("DynamicsConfig: background", self.background, BACKGROUNDS)
         if self.is_asymmetric and self.norm == "batch":
             raise ValueError('DynamicsConfig: background="asymmetric" needs norm="layer"')
         if self.is_relightable and self.explicit:

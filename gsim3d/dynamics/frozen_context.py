@@ -37,60 +37,35 @@ ALL_CURVES = (0, 1, 2, 3)
 
 @dataclass(frozen=True)
 class Field:
-    """The D cells to which the background contributes in a convolution; the last one is NOWHERE.
+    """The D cells to which the background contributes in a convolution; the last one is NOWHERE."""
 
-    Attributes:
-        cells: int64 [D], ascending keys.
-        occupied: int64 [V], indices of the cells of the background's voxels.
-        voxels: one voxel for each cell.
-        kernel_map: taps from occupied cells to all cells.
-    """
-
-    cells: Tensor
-    occupied: Tensor
-    voxels: Voxels
-    kernel_map: KernelMap
+    cells: Tensor  #: int64 [D], ascending keys
+    occupied: Tensor  #: int64 [V], indices of the cells of the background's voxels
+    voxels: Voxels  #: one voxel for each cell
+    kernel_map: KernelMap  #: taps from occupied cells to all cells
 
 
 @dataclass(frozen=True)
 class Places:
-    """Lookup tables of the background at one level.
+    """Lookup tables of the background at one level. A scene's first patch starts at the lowest key of the scene."""
 
-    Attributes:
-        cells: kernel size -> cells of the field.
-        first: int64 [4, P], first key of each patch along each curve; the first patch of a scene starts at the lowest
-            key of the scene.
-        kv_rows: int64 [4, M], rows of the attention keys, as in :class:`PatchTable`.
-        cu_k: int64 [P + 1], offsets of the patches in ``kv_rows``.
-        patch_size: largest number of keys of a patch.
-    """
-
-    cells: dict[int, Tensor]
-    first: Tensor
-    kv_rows: Tensor
-    cu_k: Tensor
-    patch_size: int
+    cells: dict[int, Tensor]  #: kernel size -> cells of the field
+    first: Tensor  #: int64 [4, P], first key of each patch along each curve
+    kv_rows: Tensor  #: int64 [4, M], rows of the attention keys, as in :class:`PatchTable`
+    cu_k: Tensor  #: int64 [P + 1], offsets of the patches in ``kv_rows``
+    patch_size: int  #: largest number of keys of a patch
 
 
 @dataclass(frozen=True)
 class FrozenContext:
-    """Cached activations of the background for all calls of a rollout.
+    """Cached activations of the background for all calls of a rollout."""
 
-    Attributes:
-        curves: indices of the curves of each level, also for calls that read the context.
-        depths: depth of the curves of each level.
-        places: lookup tables of each level; empty if the background has no particles.
-        fields: convolution -> contribution to each cell [D, C].
-        keys: attention -> keys [N, H, C / H].
-        values: attention -> values [N, H, C / H].
-    """
-
-    curves: tuple[tuple[int, ...], ...]
-    depths: tuple[int, ...]
-    places: tuple[Places, ...]
-    fields: dict[nn.Module, Tensor] = field(default_factory=dict)
-    keys: dict[nn.Module, Tensor] = field(default_factory=dict)
-    values: dict[nn.Module, Tensor] = field(default_factory=dict)
+    curves: tuple[tuple[int, ...], ...]  #: indices of the curves of each level, also for calls that read the context
+    depths: tuple[int, ...]  #: depth of the curves of each level
+    places: tuple[Places, ...]  #: lookup tables of each level; empty if the background has no particles
+    fields: dict[nn.Module, Tensor] = field(default_factory=dict)  #: convolution -> contribution to each cell [D, C]
+    keys: dict[nn.Module, Tensor] = field(default_factory=dict)  #: attention -> keys [N, H, C / H]
+    values: dict[nn.Module, Tensor] = field(default_factory=dict)  #: attention -> values [N, H, C / H]
 
     @classmethod
     def begin(

@@ -12,19 +12,12 @@ from gsim3d.state import ASLEEP, FROZEN, Particles, last_steps, newest_clouds
 
 @dataclass(frozen=True)
 class Partition:
-    """Moving particles and background of a history. Scenes without moving particles are in neither part.
+    """Moving particles and background of a history. Scenes without moving particles are in neither part."""
 
-    Attributes:
-        newest: newest cloud of every scene, with all its particles.
-        moving: all clouds, reduced to moving particles.
-        background: static, awake particles of the newest clouds; None for symmetric models.
-        rows: int64, indices into ``newest`` of the newest particles in ``moving``.
-    """
-
-    newest: Particles
-    moving: Particles
-    background: Particles | None
-    rows: Tensor
+    newest: Particles  #: newest cloud of every scene, with all its particles
+    moving: Particles  #: all clouds, reduced to moving particles
+    background: Particles | None  #: static, awake particles of the newest clouds; None for symmetric models
+    rows: Tensor  #: int64, indices into ``newest`` of the newest particles in ``moving``
 
     @classmethod
     def of(cls, history: Particles, *, asymmetric: bool, asleep: Tensor | None = None) -> Partition:

@@ -30,19 +30,12 @@ WEIGHTS = (1 << 3 * CUBE_BITS, 1 << 2 * CUBE_BITS, 1 << CUBE_BITS, 1)  # of scen
 
 @dataclass
 class RestLog:
-    """Counts of computed particles in a rollout.
+    """Counts of computed particles in a rollout."""
 
-    Attributes:
-        n_rows: particles of the newest clouds of all scenes.
-        moving: computed particles of each step.
-        remembered: number of computed backgrounds.
-        calls: calls of the network for moving particles.
-    """
-
-    n_rows: int = 0
-    moving: list[int] = field(default_factory=list)
-    remembered: int = 0
-    calls: int = 0
+    n_rows: int = 0  #: particles of the newest clouds of all scenes
+    moving: list[int] = field(default_factory=list)  #: computed particles of each step
+    remembered: int = 0  #: number of computed backgrounds
+    calls: int = 0  #: calls of the network for moving particles
 
     @property
     def resting_share(self) -> float:

@@ -29,18 +29,12 @@ class StateLayout:
 
     SH coefficients are flattened as (3, K), quaternions as (x, y, z, w). Changes of rotations are predicted as rotation
     vectors in world axes. Outputs repeat for each step of a call; the gains of priors follow them.
-
-    Attributes:
-        config: configuration of the model.
-        inputs: (attribute, channels) pairs.
-        outputs: (attribute, channels) pairs of one step.
-        gains: (prior, channels, attribute that the gains change).
     """
 
-    config: DynamicsConfig
-    inputs: tuple[tuple[str, int], ...]
-    outputs: tuple[tuple[str, int], ...]
-    gains: tuple[tuple[str, int, str], ...] = ()
+    config: DynamicsConfig  #: configuration of the model
+    inputs: tuple[tuple[str, int], ...]  #: (attribute, channels) pairs
+    outputs: tuple[tuple[str, int], ...]  #: (attribute, channels) pairs of one step
+    gains: tuple[tuple[str, int, str], ...] = ()  #: (prior, channels, attribute that the gains change)
 
     @classmethod
     def of(cls, config: DynamicsConfig, priors: Iterable[Prior] = ()) -> StateLayout:

@@ -24,7 +24,7 @@ from torch.nn import functional as F
 
 from gsim3d.effects.selection import Selection, Vector, newest_mask
 from gsim3d.effects.spec import StructureEffects
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, check_one_of
 from gsim3d.io.files import read_yaml, shown
 from gsim3d.io.settings import from_dict
 from gsim3d.math.rotations import quat_product, rotate_left, rotation_matrices
@@ -225,14 +225,10 @@ class Insert(Operation):
                 wanted = "insert particles of the same model"
                 raise InputError(f"particles.{field} differs in shape from the state; {wanted}")
         given = given.select_rows(chosen).to(state.means.device)
-        table = state.clouds
+        table, steps = state.clouds, given.clouds.steps
         newest = {table.scenes[q]: table.steps[q] for q in newest_clouds(table)}
-        ages = [given.clouds.steps[-1] - step for step in given.clouds.steps]
-        runs = []
-        for scene, step in zip(table.scenes, table.steps):
-            age = newest[scene] - step
-            q = ages.index(age) if age in ages else None
-            runs.append((0, 0) if q is None else given.clouds.row_runs([q])[0])
+        by_age = {steps[-1] - step: given.clouds.row_runs([q])[0] for q, step in enumerate(steps)}
+        runs = [by_age.get(newest[scene] - step, (0, 0)) for scene, step in zip(table.scenes, table.steps)]
         counts = table.with_counts(b - a for a, b in runs)
         fields = {name: torch.cat([x[a:b] for a, b in runs]) for name, x in given.row_fields().items()}
         own = {"origin": state.origin, "world_offset": state.world_offset}
@@ -319,8 +315,7 @@ def _edit(values: Any, where: str, folder: Path, encode: Callable[[Path], Partic
     step, op = values.pop("step", None), values.pop("op", None)
     if isinstance(step, bool) or not isinstance(step, int):
         raise InputError(f"{where}: step must be a whole number; got {shown(step)}")
-    if not isinstance(op, str) or op not in OPERATIONS:
-        raise InputError(f"{where} at step {step}: op must be one of {', '.join(OPERATIONS)}; got {shown(op)}")
+    check_one_of(f"{where} at step {step}: op", op, OPERATIONS)
     where = f"{where} at step {step}, {op}"
     kind, given = OPERATIONS[op], {}
     if kind is Insert:

@@ -22,25 +22,15 @@ BLENDING, PROJECTION = 12, 250  # multiply-adds of blending, and of projecting, 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a simulator computes for a spec. Everything else launches no kernel and allocates no memory.
+    """What a simulator computes for a spec. Everything else launches no kernel and allocates no memory."""
 
-    Attributes:
-        spec: effects of the scene.
-        history: steps in the model's input.
-        sh_degree: degree of the spherical harmonics of rendered colours.
-        priors: types of the model's priors in order of application.
-        switches: (name, setting) of every effect that is on.
-        outputs: names of the rendered images.
-        unused: names of parameters that the plan does not read; checkpoints may lack them.
-    """
-
-    spec: EffectsSpec
-    history: int
-    sh_degree: int
-    priors: tuple[str, ...]
-    switches: tuple[tuple[str, str], ...]
-    outputs: tuple[str, ...]
-    unused: tuple[str, ...] = ()
+    spec: EffectsSpec  #: effects of the scene
+    history: int  #: steps in the model's input
+    sh_degree: int  #: degree of the spherical harmonics of rendered colours
+    priors: tuple[str, ...]  #: types of the model's priors in order of application
+    switches: tuple[tuple[str, str], ...]  #: (name, setting) of every effect that is on
+    outputs: tuple[str, ...]  #: names of the rendered images
+    unused: tuple[str, ...] = ()  #: names of parameters that the plan does not read; checkpoints may lack them
 
     @property
     def on(self) -> tuple[str, ...]:
@@ -50,21 +40,13 @@ class Plan:
 
 @dataclass(frozen=True)
 class Workload:
-    """Sizes of a scene, for cost predictions.
+    """Sizes of a scene, for cost predictions."""
 
-    Attributes:
-        moving: movable particles of a step.
-        frozen: frozen particles of a step.
-        views: images of a step.
-        pixels: pixels of an image.
-        actions: points of actors.
-    """
-
-    moving: int
-    frozen: int
-    views: int = 1
-    pixels: int = 64 * 64
-    actions: int = 0
+    moving: int  #: movable particles of a step
+    frozen: int  #: frozen particles of a step
+    views: int = 1  #: images of a step
+    pixels: int = 64 * 64  #: pixels of an image
+    actions: int = 0  #: points of actors
 
 
 def make_plan(spec: EffectsSpec, model: ModelConfig) -> Plan:

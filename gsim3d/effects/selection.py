@@ -9,8 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from gsim3d.errors import InputError, did_you_mean
-from gsim3d.io.files import shown
+from gsim3d.errors import InputError, check_one_of
 from gsim3d.state import DYNAMIC, FROZEN, Particles
 
 Vector = tuple[float, float, float]
@@ -34,10 +33,7 @@ class Selection:
     alone: ClassVar[str] = "which"  # field that a plain string in a file sets
 
     def __post_init__(self):
-        if self.which not in KINDS:
-            raise InputError(
-                f"which must be one of {', '.join(KINDS)}; got {shown(self.which)}{did_you_mean(self.which, KINDS)}"
-            )
+        check_one_of("which", self.which, KINDS)
         if self.box is not None and any(low > high for low, high in zip(*self.box, strict=True)):
             corners = [list(corner) for corner in self.box]
             raise InputError(f"box must be the lowest and the highest corner; got {corners}")

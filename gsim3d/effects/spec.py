@@ -13,7 +13,7 @@ from typing import Any
 import yaml
 
 from gsim3d.effects.selection import Selection
-from gsim3d.errors import InputError, did_you_mean
+from gsim3d.errors import InputError, check_one_of
 from gsim3d.io.files import read_yaml, shown, write_whole
 from gsim3d.io.settings import from_dict
 
@@ -46,7 +46,7 @@ class Sleep:
     halo: float = 0.05
 
     def __post_init__(self):
-        _one_of("dynamics.sleep.policy", self.policy, POLICIES)
+        check_one_of("effects: dynamics.sleep.policy", self.policy, POLICIES)
         _at_least("dynamics.sleep.eps", self.eps, 0)
         _at_least("dynamics.sleep.patience", self.patience, 1)
         if not 0 < self.halo < math.inf:
@@ -73,7 +73,7 @@ class DynamicsEffects:
     actions: tuple[str, ...] = ()
 
     def __post_init__(self):
-        _one_of("dynamics.background", self.background, BACKGROUNDS)
+        check_one_of("effects: dynamics.background", self.background, BACKGROUNDS)
         if self.history is not None:
             _at_least("dynamics.history", self.history, 1)
 
@@ -99,7 +99,7 @@ class AppearanceEffects:
     def __post_init__(self):
         selections = (Selection(of) if isinstance(of, str) else of for of in self.frozen_appearance)
         object.__setattr__(self, "frozen_appearance", tuple(selections))
-        _one_of("appearance.changing", self.changing, CHANGING)
+        check_one_of("effects: appearance.changing", self.changing, CHANGING)
         if self.view_dependent not in (None, 0, 1, 2, 3):
             raise InputError(f"effects: appearance.view_dependent must be 0 to 3; got {self.view_dependent}")
 
@@ -220,13 +220,6 @@ def _converted(values: dict[str, Any]) -> dict[str, Any]:
         renamed = {"held": "frozen_appearance"}
         values = values | {"appearance": {renamed.get(name, name): value for name, value in appearance.items()}}
     return values
-
-
-def _one_of(name: str, value: Any, allowed: tuple[str, ...]) -> None:
-    if value not in allowed:
-        raise InputError(
-            f"effects: {name} must be one of {', '.join(allowed)}; got {shown(value)}{did_you_mean(value, allowed)}"
-        )
 
 
 def _at_least(name: str, value: Any, least: int) -> None:

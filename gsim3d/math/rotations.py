@@ -27,15 +27,13 @@ def quat_product(a: Tensor, b: Tensor) -> Tensor:
 def rotation_to_quat(rotations: Tensor) -> Tensor:
     """[..., 3, 3] -> [..., 4] unit quaternions (w, x, y, z), from the largest component, which divides safely."""
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (row.unbind(-1) for row in rotations.unbind(-2))
-    rows = torch.stack(
-        [
-            torch.stack([1 + xx + yy + zz, zy - yz, xz - zx, yx - xy], -1),
-            torch.stack([zy - yz, 1 + xx - yy - zz, xy + yx, xz + zx], -1),
-            torch.stack([xz - zx, xy + yx, 1 - xx + yy - zz, yz + zy], -1),
-            torch.stack([yx - xy, xz + zx, yz + zy, 1 - xx - yy + zz], -1),
-        ],
-        -2,
-    )
+    rows = [
+        [1 + xx + yy + zz, zy - yz, xz - zx, yx - xy],
+        [zy - yz, 1 + xx - yy - zz, xy + yx, xz + zx],
+        [xz - zx, xy + yx, 1 - xx + yy - zz, yz + zy],
+        [yx - xy, xz + zx, yz + zy, 1 - xx - yy + zz],
+    ]
+    rows = torch.stack([torch.stack(row, -1) for row in rows], -2)
     largest = rows.diagonal(dim1=-2, dim2=-1).argmax(-1)
     chosen = rows.gather(-2, largest[..., None, None].expand(*largest.shape, 1, 4))[..., 0, :]
     return F.normalize(chosen, dim=-1)
@@ -75,7 +73,4 @@ def rotate_left(quats: Tensor, rotation_vectors: Tensor) -> Tensor:
     ratio = torch.where(small, 0.5 - angle_squared / 48, torch.sin(angle / 2) / angle)
     w = torch.where(small, 1 - angle_squared / 8, torch.cos(angle / 2))
     v = ratio * rotation_vectors
-    quats = unit_quats(quats)
-    qw, qv = quats[:, :1], quats[:, 1:]
-    turned = torch.cat([w * qw - (v * qv).sum(1, keepdim=True), w * qv + qw * v + torch.linalg.cross(v, qv)], 1)
-    return with_positive_largest(turned)
+    return with_positive_largest(quat_product(torch.cat([w, v], 1), unit_quats(quats)))

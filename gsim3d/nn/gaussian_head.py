@@ -24,22 +24,15 @@ NEAR_PLANE = 0.01  # metres; what is nearer to a camera is not drawn
 
 @dataclass(frozen=True)
 class RendererConfig:
-    """How particles become Gaussians.
+    """How particles become Gaussians."""
 
-    Attributes:
-        latents: channels of dynamic and static latents together; 0 for explicit particles, whose head has no weights.
-        sh_degree: 0 to 3, of the view-dependent colour.
-        scale_min: metres, lower limit of predicted scales.
-        scale_max: metres, upper limit.
-        initial_scale: metres, scale that an untrained head predicts; None: the middle of the limits.
-        jacobian: "exact", or "clamped" of models that were trained so; see :func:`gsim3d.ops.rasterize_gaussians`.
-    """
-
+    #: channels of dynamic and static latents together; 0 for explicit particles, whose head has no weights
     latents: int = 64
-    sh_degree: int = 3
-    scale_min: float = 0.0002
-    scale_max: float = 0.1
-    initial_scale: float | None = None
+    sh_degree: int = 3  #: 0 to 3, of the view-dependent colour
+    scale_min: float = 0.0002  #: metres, lower limit of predicted scales
+    scale_max: float = 0.1  #: metres, upper limit
+    initial_scale: float | None = None  #: metres, scale that an untrained head predicts; None: the middle of the limits
+    #: "exact", or "clamped" of models that were trained so; see :func:`gsim3d.ops.rasterize_gaussians`
     jacobian: Literal["exact", "clamped"] = "exact"
 
     def __post_init__(self):

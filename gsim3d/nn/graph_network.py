@@ -32,15 +32,10 @@ MAX_HISTORY_BITS = 5  # edges to a node grow with the steps of a history
 
 @dataclass(frozen=True, kw_only=True)
 class GraphConfig:
-    """Size of a :class:`GraphNetwork`. A node is a cell of ``grid_size``, with edges to the 27 cells around it.
+    """Size of a :class:`GraphNetwork`. A node is a cell of ``grid_size``, with edges to the 27 cells around it."""
 
-    Attributes:
-        channels: of a node, and of an edge.
-        layers: rounds of message passing between the nodes of the newest step.
-    """
-
-    channels: int = 128
-    layers: int = 8
+    channels: int = 128  #: of a node, and of an edge
+    layers: int = 8  #: rounds of message passing between the nodes of the newest step
 
     def __post_init__(self):
         check_ranges(self, channels=(1, 10**5), layers=(0, 100))
@@ -53,17 +48,11 @@ def graph_spec(grid_size: float, history_bits: int) -> PyramidSpec:
 
 @dataclass(frozen=True)
 class Graph:
-    """E edges between N nodes, sorted by receiver; edges behind the last receiver's join none.
+    """E edges between N nodes, sorted by receiver; edges behind the last receiver's join none."""
 
-    Attributes:
-        senders: edges that each node sends.
-        receivers: edges that each node receives.
-        age: [E, 1], steps by which the sender is older than the receiver, over the longest history.
-    """
-
-    senders: Segments
-    receivers: Segments
-    age: Tensor
+    senders: Segments  #: edges that each node sends
+    receivers: Segments  #: edges that each node receives
+    age: Tensor  #: [E, 1], steps by which the sender is older than the receiver, over the longest history
 
     @classmethod
     def of(cls, stage: Stage, longest: int, like: Tensor, *, earlier: bool) -> Graph:
@@ -90,17 +79,13 @@ class Graph:
         age = age.reshape(-1, 1)[order[0]].to(like) / longest
         return cls(_ends(senders[order[0]], stage.n_rows), _ends(receivers[order[0]], stage.n_rows), age)
 
-    def from_senders(self, x: Tensor) -> Tensor:
-        """Values of nodes [N, C] at the edges that they send [E, C]."""
-        return ops.unpool(x, self.senders.rows, self.senders.cu_rows, self.age.shape[0], check=False)
-
-    def from_receivers(self, x: Tensor) -> Tensor:
-        """Values of nodes [N, C] at the edges that they receive [E, C]."""
-        return ops.unpool(x, self.receivers.rows, self.receivers.cu_rows, self.age.shape[0], check=False)
+    def at_edges(self, x: Tensor, ends: Segments) -> Tensor:
+        """Values of nodes [N, C] at the edges [E, C] of which they are the senders, or the receivers."""
+        return ops.unpool(x, ends.rows, ends.cu_rows, self.age.shape[0], check=False)
 
     def features(self, positions: Tensor) -> Tensor:
         """[E, 5]: difference of positions, its square, age."""
-        apart = self.from_senders(positions) - self.from_receivers(positions)
+        apart = self.at_edges(positions, self.senders) - self.at_edges(positions, self.receivers)
         return torch.cat([apart, apart.square().sum(1, keepdim=True), self.age], 1)
 
 
@@ -148,7 +133,8 @@ class Interaction(nn.Module):
 
     def forward(self, nodes: Tensor, edges: Tensor, graph: Graph) -> tuple[Tensor, Tensor]:
         """Nodes [N, C] and edges [E, C] after the round."""
-        ends = graph.from_senders(self.sender(nodes)) + graph.from_receivers(self.receiver(nodes))
+        ends = graph.at_edges(self.sender(nodes), graph.senders)
+        ends = ends + graph.at_edges(self.receiver(nodes), graph.receivers)
         edges = self.edge_norm(self.message(F.gelu(self.edge(edges) + ends)), edges)
         total = ops.segment_sum(edges, graph.receivers.cu_rows, check=False)
         return self.node(torch.cat([nodes, total], 1), nodes), edges

@@ -200,8 +200,7 @@ class RowBatchNorm(nn.Module):
         return norm_gelu(x, *self._mean_and_scale(x), self.bias, check=False)
 
     def activated_in_training(self, x: Tensor, n_data: int | None = None) -> Tensor:
-        """``F.gelu(self(x))`` by statistics of the rows, with one node of autograd; once differentiable. Arguments as
-        :meth:`activated`; gradients of other rows must be 0."""
+        """As :meth:`activated`, with one node of autograd; once differentiable. Gradients of other rows must be 0."""
         with torch.no_grad():
             mean, var, n_rows = _statistics_at_once(x[:n_data])
             self._follow(mean, var, n_rows)
@@ -328,11 +327,8 @@ def make_norm(kind: str, channels: int) -> nn.Module:
 
 @contextlib.contextmanager
 def tf32_only_if_asked():
-    """A context in which a GPU's float32 convolutions use TF32 only if matrix products may.
-
-    Torch has a switch for each, and that of convolutions is on unless it is turned off. How TF32 rounds depends on
-    the algorithm, which cuDNN chooses by the number of images: a scene would differ from itself in a larger batch.
-    """
+    """A context in which a GPU's float32 convolutions use TF32 only if matrix products may: how it rounds depends on
+    the algorithm, which cuDNN chooses by the number of images: a scene would differ from itself in a larger batch."""
     products, cudnn = torch.backends.cuda.matmul, torch.backends.cudnn
     unasked = cudnn.conv.fp32_precision == "tf32" and products.fp32_precision != "tf32"
     if unasked:

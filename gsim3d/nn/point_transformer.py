@@ -33,40 +33,25 @@ COLUMN_MULTIPLE = 8  # of a matrix product; with others the bits of a row depend
 
 @dataclass(frozen=True, kw_only=True)
 class TransformerConfig:
-    """Geometry and layers of a :class:`PointTransformer` of S levels; every per-level tuple starts at the finest.
+    """Geometry and layers of a :class:`PointTransformer` of S levels; every per-level tuple starts at the finest."""
 
-    Attributes:
-        grid_size: metres, edge of a cell at level 0.
-        history_bits: a history has 1 to 2^history_bits steps.
-        strides, merge_windows: S - 1 powers of two: how much coarser the next level is, how many steps it merges.
-        patch_sizes: particles that attend to each other.
-        time_embedding: a learned vector distinguishes merged steps.
-        encoder_depths, encoder_channels, encoder_heads: S each.
-        decoder_depths, decoder_channels, decoder_heads: S - 1 each, levels 0 to S - 2.
-        mlp_ratio: hidden channels of a block's MLP over its channels.
-        norm: "layer", or "batch" as published: evaluation uses running statistics, training those of the call.
-        zero_init: the last layer starts at zero: an untrained model that predicts differences predicts none.
-        drop_path: share of particles that skip a branch of a block, growing from 0 at the first block. In training.
-        checkpointing: blocks are computed again in the backward pass instead of being kept.
-    """
-
-    grid_size: float = 0.004
-    history_bits: int = 2
-    strides: tuple[int, ...] = (4, 2, 2, 2)
-    merge_windows: tuple[int, ...] = (2, 2, 2, 8)
-    patch_sizes: tuple[int, ...] = (1024,) * 5
-    time_embedding: bool = True
-    encoder_depths: tuple[int, ...] = (2, 2, 2, 6, 2)
-    encoder_channels: tuple[int, ...] = (32, 64, 128, 256, 512)
-    encoder_heads: tuple[int, ...] = (2, 4, 8, 16, 32)
-    decoder_depths: tuple[int, ...] = (2, 2, 2, 2)
-    decoder_channels: tuple[int, ...] = (64, 64, 128, 256)
-    decoder_heads: tuple[int, ...] = (4, 4, 8, 16)
-    mlp_ratio: int = 4
-    norm: str = "batch"
-    zero_init: bool = False
-    drop_path: float = 0.3
-    checkpointing: bool = False
+    grid_size: float = 0.004  #: metres, edge of a cell at level 0
+    history_bits: int = 2  #: a history has 1 to 2^history_bits steps
+    strides: tuple[int, ...] = (4, 2, 2, 2)  #: S - 1 powers of two: how much coarser the next level is
+    merge_windows: tuple[int, ...] = (2, 2, 2, 8)  #: S - 1 powers of two: how many steps the next level merges
+    patch_sizes: tuple[int, ...] = (1024,) * 5  #: particles that attend to each other
+    time_embedding: bool = True  #: a learned vector distinguishes merged steps
+    encoder_depths: tuple[int, ...] = (2, 2, 2, 6, 2)  #: S, blocks
+    encoder_channels: tuple[int, ...] = (32, 64, 128, 256, 512)  #: S
+    encoder_heads: tuple[int, ...] = (2, 4, 8, 16, 32)  #: S
+    decoder_depths: tuple[int, ...] = (2, 2, 2, 2)  #: S - 1, blocks of levels 0 to S - 2
+    decoder_channels: tuple[int, ...] = (64, 64, 128, 256)  #: S - 1, of levels 0 to S - 2
+    decoder_heads: tuple[int, ...] = (4, 4, 8, 16)  #: S - 1, of levels 0 to S - 2
+    mlp_ratio: int = 4  #: hidden channels of a block's MLP over its channels
+    norm: str = "batch"  #: "layer", or "batch" as published: evaluation uses running statistics, training the call's
+    zero_init: bool = False  #: the last layer starts at zero: untrained models that predict differences predict none
+    drop_path: float = 0.3  #: share of particles that skip a branch of a block in training, growing from 0 at the first
+    checkpointing: bool = False  #: blocks are computed again in the backward pass instead of being kept
 
     origin_of_scene: ClassVar[bool] = True  # cells are counted from the origin of a scene: scenes are independent
     slots_from_newest: ClassVar[bool] = True  # steps are counted back from the newest, in histories of any length
@@ -127,17 +112,11 @@ class FrozenContext(Protocol):
 
 
 class Extension(Protocol):
-    """Further inputs and outputs of a network with weights of their own, joined to its products in order.
+    """Further inputs and outputs of a network with weights of their own, joined to its products in order."""
 
-    Attributes:
-        conv_proj: convolution of further inputs into the stem; None: there are none.
-        in_proj: product of inputs that are not convolved.
-        gain_head: product of the last hidden channels, for further outputs.
-    """
-
-    conv_proj: SparseConv | None
-    in_proj: RowLinear | None
-    gain_head: RowLinear | None
+    conv_proj: SparseConv | None  #: convolution of further inputs into the stem; None: there are none
+    in_proj: RowLinear | None  #: product of inputs that are not convolved
+    gain_head: RowLinear | None  #: product of the last hidden channels, for further outputs
 
 
 class SparseConv(nn.Module):
@@ -251,7 +230,7 @@ class Block(nn.Module):
         return self._compute(x, conv_input, stage, row, *keep, context)
 
     def is_fused(self, x: Tensor, context: FrozenContext | None = None) -> bool:
-        if (context is not None and context.records) or (context is not None and torch.is_grad_enabled()):
+        if context is not None and (context.records or torch.is_grad_enabled()):
             return False
         if torch.compiler.is_compiling() or type(self.attention) is not Attention:  # a subclass computes otherwise
             return False
@@ -386,9 +365,8 @@ class EncoderStage(nn.Module):
         n_merged = 2 ** config.pyramid_spec(config.history_bits).merged_bits()[index]
         newest = n_merged - 1 if config.slots_from_newest and n_merged > 1 else None
         self.merge = Merge(window, channels[index], newest) if window > 1 and config.time_embedding else None
-        self.blocks = nn.ModuleList(
-            Block(channels[index], config.encoder_heads[index], drop_path, config) for drop_path in drop_paths
-        )
+        heads = config.encoder_heads[index]
+        self.blocks = nn.ModuleList(Block(channels[index], heads, rate, config) for rate in drop_paths)
 
     def forward(
         self, x: Tensor, stage: Stage, generator: torch.Generator | None, context: FrozenContext | None = None
@@ -425,9 +403,8 @@ class DecoderStage(nn.Module):
         channels = config.decoder_channels
         below = (*channels, config.encoder_channels[-1])[index + 1]
         self.unpool = Unpool(below, config.encoder_channels[index], channels[index], config.norm)
-        self.blocks = nn.ModuleList(
-            Block(channels[index], config.decoder_heads[index], drop_path, config) for drop_path in drop_paths
-        )
+        heads = config.decoder_heads[index]
+        self.blocks = nn.ModuleList(Block(channels[index], heads, rate, config) for rate in drop_paths)
         self.is_last = index == 0
 
     def forward(

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from gsim3d import ops
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, check_one_of
 from gsim3d.nn.point_transformer import (
     Block,
     Pool,
@@ -70,9 +70,8 @@ class PointTransformerV3Config:
 
     def __post_init__(self):
         name = type(self).__name__
-        for field, known in {"mirror": MIRRORS, "depth_rule": DEPTH_RULES}.items():
-            if getattr(self, field) not in known:
-                raise InputError(f"{name}: {field} must be one of {', '.join(known)}; got {getattr(self, field)!r}")
+        check_one_of(f"{name}: mirror", self.mirror, MIRRORS)
+        check_one_of(f"{name}: depth_rule", self.depth_rule, DEPTH_RULES)
         if not 1 <= len(self.curves) <= N_LISTS or not set(self.curves) <= set(CURVES):
             raise InputError(f"{name}: curves must be 1 to {N_LISTS} of {', '.join(CURVES)}; got {self.curves}")
         self.layers()

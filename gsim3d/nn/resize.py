@@ -14,16 +14,10 @@ Kind = Literal["linear", "corners", "cubic"]
 
 
 def resize(x: Tensor, size: tuple[int, int], kind: Kind = "linear", offset: float = 0.0) -> Tensor:
-    """Returns maps of another size.
+    """Returns maps [..., h, w] at another size (height, width), in their dtype, also under autocast.
 
-    Args:
-        x: [..., h, w].
-        size: (height, width) of the result.
-        kind: "linear" averages over the pixels that a smaller pixel covers; "corners" aligns the centres of the
-            outermost pixels; "cubic" is bicubic, without averaging.
-        offset: added to ``size`` where it gives the scale.
-    Returns:
-        [..., *size] in the dtype of ``x``, also under autocast.
+    "linear" averages over the pixels that a smaller pixel covers; "corners" aligns the centres of the outermost pixels;
+    "cubic" is bicubic, without averaging. ``offset`` is added to ``size`` where it gives the scale.
     """
     if tuple(x.shape[-2:]) == tuple(size):
         return x

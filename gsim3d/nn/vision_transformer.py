@@ -27,40 +27,25 @@ CAMERA_HEADS, CAMERA_SCALE = 16, 0.01  # heads of the camera encoder, and its un
 class Architecture:
     """Sizes of a backbone and of its DPT heads.
 
-    Attributes:
-        dim: C, channels of the tokens.
-        heads: attention heads.
-        blocks: transformer blocks.
-        taken: blocks whose tokens the heads read, four, ascending.
-        mixes_from: from this block on, odd blocks attend over all views; None: each view is alone.
-        head_dim: channels of the heads' fused maps.
-        head_channels: channels of the heads' four maps before fusion.
-        mlp_ratio: hidden channels of the feed-forward parts over C.
-        camera_blocks: blocks of the camera encoder.
-        grid: rows and columns of the learned position embedding.
-        patch: pixels of a patch along each axis.
-        offset: added to the number of patches where the position embedding is resized.
-        eps: of the last norm.
-        unit: what a predicted depth of 1 is in metres: "cameras", the lower median of the cameras' distances to the
-            first one, at least 0.1, as Depth Anything 3 was trained, or "range", the geometric mean of near and far.
-        timm: name of a model of timm, which then is the backbone.
+    A predicted depth of 1 is ``unit`` in metres: "cameras", the lower median of the cameras' distances to the first
+    one, at least 0.1, as Depth Anything 3 was trained, or "range", the geometric mean of near and far.
     """
 
-    dim: int
-    heads: int
-    blocks: int
-    taken: tuple[int, ...]
-    mixes_from: int | None
-    head_dim: int
-    head_channels: tuple[int, ...]
-    mlp_ratio: int = 4
-    camera_blocks: int = 4
-    grid: int = 37
-    patch: int = 14
-    offset: float = 0.0
-    eps: float = 1e-6
-    unit: Literal["cameras", "range"] = "range"
-    timm: str = ""
+    dim: int  #: C, channels of the tokens
+    heads: int  #: attention heads
+    blocks: int  #: transformer blocks
+    taken: tuple[int, ...]  #: blocks whose tokens the heads read, four, ascending
+    mixes_from: int | None  #: from this block on, odd blocks attend over all views; None: each view is alone
+    head_dim: int  #: channels of the heads' fused maps
+    head_channels: tuple[int, ...]  #: channels of the heads' four maps before fusion
+    mlp_ratio: int = 4  #: hidden channels of the feed-forward parts over C
+    camera_blocks: int = 4  #: blocks of the camera encoder
+    grid: int = 37  #: rows and columns of the learned position embedding
+    patch: int = 14  #: pixels of a patch along each axis
+    offset: float = 0.0  #: added to the number of patches where the position embedding is resized
+    eps: float = 1e-6  #: of the last norm
+    unit: Literal["cameras", "range"] = "range"  #: of predicted depths
+    timm: str = ""  #: name of a model of timm, which then is the backbone
 
     @property
     def token_dim(self) -> int:
@@ -174,15 +159,9 @@ class ViT(nn.Module):
         return torch.cat([of_class, resize(maps, grid, "cubic", self.config.offset).flatten(2).mT], 1)
 
     def forward(self, images: Tensor, n_views: int = 1, camera_tokens: Tensor | None = None) -> Tensor:
-        """Returns tokens of patches.
-
-        Args:
-            images: [I, 3, H, W], multiples of the patch; the V views of a scene follow each other.
-            n_views: V.
-            camera_tokens: [I, C] of the camera encoder. None: learned tokens, of the first view and of the others.
-        Returns:
-            [I, 4, h w, C]; where views mix [I, 4, h w, 2 C], of the last block within a view and of the taken one.
-        """
+        """Tokens of patches [I, 4, h w, C] of images [I, 3, H, W], multiples of the patch, V views of a scene after
+        each other; where views mix [I, 4, h w, 2 C], of the last block within a view and of the taken one.
+        ``camera_tokens``: [I, C] of the camera encoder; None: learned ones, of the first view and of the others."""
         config, grid = self.config, tuple(n // self.config.patch for n in images.shape[2:])
         x = self.patch_embed(images).flatten(2).mT
         x = torch.cat([self.cls_token.expand(len(x), -1, -1), x], 1) + self.positions(grid)

@@ -21,7 +21,7 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, check_one_of
 
 OnInvalid = Literal["raise", "drop", "clamp"]
 LARGEST = torch.finfo(torch.float32).max
@@ -33,8 +33,7 @@ PIXEL_SLACK = 1e-3  # tolerance of colours outside [0, 1], for rounding in resam
 
 def check_on_invalid(on_invalid: str) -> None:
     """Raises InputError if ``on_invalid`` is not a policy."""
-    if on_invalid not in get_args(OnInvalid):
-        raise InputError(f"on_invalid must be one of {', '.join(get_args(OnInvalid))}; got {on_invalid!r}")
+    check_one_of("on_invalid", on_invalid, get_args(OnInvalid))
 
 
 def at_most(values: Tensor, largest: float) -> Tensor:
@@ -49,18 +48,14 @@ def usable_pixels(images: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class StabilityConfig:
-    """Limits of a model's particles, and the policy for particles beyond them.
+    """Limits of a model's particles, and the policy for particles beyond them."""
 
-    Attributes:
-        on_invalid: default policy, "raise", "drop" or "clamp".
-        max_speed: largest displacement in m/step; faster particles fall asleep at their previous position. Should be
-            above the model's ``max_step``, and not far above, so that diverging particles do not affect others.
-        max_latent: largest magnitude of a latent or colour coefficient; larger values count as not finite. float16
-            overflows at about 6e4.
-    """
-
-    on_invalid: OnInvalid = "raise"
+    on_invalid: OnInvalid = "raise"  #: default policy, "raise", "drop" or "clamp"
+    #: largest displacement in m/step; faster particles fall asleep at their previous position. Should be above the
+    #: model's ``max_step``, and not far above, so that diverging particles do not affect others.
     max_speed: float = 10.0
+    #: largest magnitude of a latent or colour coefficient; larger values count as not finite. float16 overflows at
+    #: about 6e4.
     max_latent: float = 1e4
 
     def __post_init__(self):

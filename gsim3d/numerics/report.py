@@ -23,29 +23,17 @@ MAX_QUIET = 1000  # records without findings that are stored unread
 
 @dataclass(frozen=True)
 class Finding:
-    """Invalid particles or pixels of one tensor in one cloud or image.
+    """Invalid particles or pixels of one tensor in one cloud or image."""
 
-    Attributes:
-        what: kind of finding, such as "not finite", "outside the workspace" or "speed limit".
-        where: call, such as "encode" or "rollout".
-        tensor: name of the tensor.
-        action: "error", "dropped", "clamped", "asleep" (limit exceeded) or "noted".
-        count: number of particles or pixels.
-        row: index of the first one in the packed tensor.
-        scene: scene of the cloud.
-        step: step of the cloud.
-        camera: index of the image.
-    """
-
-    what: str
-    where: str
-    tensor: str
-    action: str
-    count: int
-    row: int | None = None
-    scene: int | None = None
-    step: int | None = None
-    camera: int | None = None
+    what: str  #: kind of finding, such as "not finite", "outside the workspace" or "speed limit"
+    where: str  #: call, such as "encode" or "rollout"
+    tensor: str  #: name of the tensor
+    action: str  #: "error", "dropped", "clamped", "asleep" (limit exceeded) or "noted"
+    count: int  #: number of particles or pixels
+    row: int | None = None  #: index of the first one in the packed tensor
+    scene: int | None = None  #: scene of the cloud
+    step: int | None = None  #: step of the cloud
+    camera: int | None = None  #: index of the image
 
     def __str__(self) -> str:
         location = {"scene": self.scene, "step": self.step, "camera": self.camera}
@@ -63,19 +51,12 @@ class Finding:
 
 
 class Statistics(NamedTuple):
-    """Statistics of the particles of a scene at a step.
+    """Statistics of the particles of a scene at a step."""
 
-    Attributes:
-        awake: number of awake particles.
-        kinetic_energy: half the sum of squared displacements in (m/step)^2, for unit masses.
-        opacity_mass: sum of opacities.
-        extent: diagonal of the bounding box of the awake particles in metres.
-    """
-
-    awake: int
-    kinetic_energy: float
-    opacity_mass: float
-    extent: float
+    awake: int  #: number of awake particles
+    kinetic_energy: float  #: half the sum of squared displacements in (m/step)^2, for unit masses
+    opacity_mass: float  #: sum of opacities
+    extent: float  #: diagonal of the bounding box of the awake particles in metres
 
 
 class Reading(NamedTuple):

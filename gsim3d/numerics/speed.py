@@ -16,8 +16,7 @@ from gsim3d.cuda_graphs import Prediction
 from gsim3d.effects.edits import Edit
 from gsim3d.effects.plan import Plan
 from gsim3d.effects.spec import EffectsSpec, Sleep
-from gsim3d.errors import InputError, check_ranges, did_you_mean
-from gsim3d.io.files import shown
+from gsim3d.errors import InputError, check_one_of, check_ranges
 from gsim3d.io.settings import from_dict
 from gsim3d.numerics.trust import MOST_LEFT_OUT, check_input, read_checkpoints, without_oldest
 from gsim3d.ops.raster import CUTOFFS, Rendering
@@ -33,44 +32,28 @@ SPEEDS_FILE = "speeds.json"  # {digest of a checkpoint: {device type: {speed: se
 
 @dataclass(frozen=True)
 class Setting:
-    """Options of inference. The default is the reference: float32 without approximations.
+    """Options of inference. The default is the reference: float32 without approximations."""
 
-    Attributes:
-        encoder: precision, "fp32", "tf32", "bf16" or "fp16"; positions, codes, splats and sums are always float32.
-        dynamics: precision of the dynamics.
-        renderer: precision of the renderer.
-        captured: rolls out with ``graph="auto"``, from a CUDA graph when calls repeat.
-        context_views: input cameras; None: as in training.
-        history: input steps; None: as in training.
-        background: replaces ``EffectsSpec.dynamics.background``; None: as in training.
-        kept: fraction of particles that are retained, the most opaque of the moving and of the other ones.
-        sh_degree: degree of rendered colours; None: the model's.
-        cutoff: as in :func:`gsim3d.ops.rasterize_gaussians`.
-        patch_size: largest number of particles in a patch; None: the model's.
-        grid: factor on the model's cell size.
-        least_opacity: smallest opacity of rendered Gaussians; contributions below 1/255 are always skipped.
-        sleep: largest displacement of a particle at rest, which sleeps, in cells/step; None: as in training.
-    """
-
+    #: precision, "fp32", "tf32", "bf16" or "fp16"; positions, codes, splats and sums are always float32
     encoder: str = "fp32"
-    dynamics: str = "fp32"
-    renderer: str = "fp32"
-    captured: bool = False
-    context_views: int | None = None
-    history: int | None = None
-    background: str | None = None
-    kept: float = 1.0
-    sh_degree: int | None = None
-    cutoff: str = "exact"
-    patch_size: int | None = None
-    grid: float = 1.0
-    least_opacity: float = 0.0
+    dynamics: str = "fp32"  #: precision of the dynamics
+    renderer: str = "fp32"  #: precision of the renderer
+    captured: bool = False  #: rolls out with ``graph="auto"``, from a CUDA graph when calls repeat
+    context_views: int | None = None  #: input cameras; None: as in training
+    history: int | None = None  #: input steps; None: as in training
+    background: str | None = None  #: replaces ``EffectsSpec.dynamics.background``; None: as in training
+    kept: float = 1.0  #: fraction of particles that are retained, the most opaque of the moving and of the other ones
+    sh_degree: int | None = None  #: degree of rendered colours; None: the model's
+    cutoff: str = "exact"  #: as in :func:`gsim3d.ops.rasterize_gaussians`
+    patch_size: int | None = None  #: largest number of particles in a patch; None: the model's
+    grid: float = 1.0  #: factor on the model's cell size
+    least_opacity: float = 0.0  #: smallest opacity of rendered Gaussians; contributions below 1/255 are always skipped
+    #: largest displacement of a particle at rest, which sleeps, in cells/step; None: as in training
     sleep: float | None = None
 
     def __post_init__(self):
         for name, known in {**dict.fromkeys(PARTS, PRECISIONS), "cutoff": CUTOFFS}.items():
-            if getattr(self, name) not in known:
-                raise InputError(f"{name} must be one of {', '.join(known)}; got {shown(getattr(self, name))}")
+            check_one_of(name, getattr(self, name), known)
         check_ranges(self, kept=(1e-6, 1), grid=(1e-3, 1e3), least_opacity=(0, 1), sleep=(0, 1e3), sh_degree=(0, 3))
         check_ranges(self, **dict.fromkeys(("context_views", "history", "patch_size"), (1, 1e6)))
         if self.captured and self.sleep is not None:
@@ -220,8 +203,7 @@ def draw(
 def load_speed(folder: Path, digest: str | None, device: str, speed: str) -> Setting:
     """Reads the tuned setting of the checkpoint in ``folder`` for a device, "cpu" or "cuda", and one of SPEEDS. Raises
     InputError if the checkpoint is not tuned for this device."""
-    if speed not in SPEEDS:
-        raise InputError(f"speed: must be one of {', '.join(SPEEDS)}; got {speed!r}{did_you_mean(speed, SPEEDS)}")
+    check_one_of("speed:", speed, SPEEDS)
     if speed == "exact":
         return Setting()
     found = read_checkpoints(folder / SPEEDS_FILE)

@@ -11,6 +11,7 @@ from itertools import accumulate
 import torch
 from torch import Tensor
 
+from gsim3d.errors import check_one_of
 from gsim3d.ops import _neighbours as neighbours
 from gsim3d.ops._arguments import check_real, check_tensors, check_whole
 from gsim3d.ops._register import fakes
@@ -57,8 +58,7 @@ def curve_encode(
     if not isinstance(names, Sequence):
         raise TypeError(f"curve_encode: curve must be a name or several; got {curve!r}")
     for name in names:
-        if name not in CURVES:
-            raise ValueError(f"curve_encode: curve must be one of {', '.join(CURVES)}; got {name!r}")
+        check_one_of("curve_encode: curve", name, CURVES)
     if cloud is None:
         cloud = torch.zeros(grid.shape[:1], dtype=torch.int64, device=grid.device)
     curves = [CURVES.index(name) for name in names]

@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsim3d.cameras import Cameras
+from gsim3d.errors import check_one_of
 from gsim3d.ops._arguments import check_floating, check_numbers, check_real, check_tensors, check_whole, within_memory
 from gsim3d.ops._register import fakes, register_autocast, register_gradients, save_inputs
 from gsim3d.ops.raster import LARGEST, check_scene
@@ -216,9 +217,8 @@ def _check(tensors: dict, cameras: Cameras, cu_rows: Tensor | None, lens: str, j
     check_scene(OP, tensors | ({} if cu_rows is None else {"cu_rows": cu_rows}), cameras)
     if ("covars" in tensors) == ("quats" in tensors or "scales" in tensors):
         raise ValueError(f"{OP}: give quats and scales, or covars")
-    for name, value, known in (("lens", lens, tuple(LENSES)), ("jacobian", jacobian, JACOBIANS)):
-        if value not in known:
-            raise ValueError(f"{OP}: {name} must be one of {', '.join(known)}; got {value!r}")
+    check_one_of(f"{OP}: lens", lens, LENSES)
+    check_one_of(f"{OP}: jacobian", jacobian, JACOBIANS)
     for name, indices in (("cameras.image_cloud", cameras.image_cloud), ("cu_rows", cu_rows)):
         if indices is not None and (indices.dtype != torch.int64 or indices.dim() != 1):
             raise ValueError(f"{OP}: {name} must be int64 and a list; got {indices.dtype} {list(indices.shape)}")

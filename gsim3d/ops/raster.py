@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsim3d._core import constants
 from gsim3d.cameras import Cameras
-from gsim3d.errors import GradientError
+from gsim3d.errors import GradientError, check_one_of
 from gsim3d.numerics.policy import OnInvalid, check_on_invalid
 from gsim3d.numerics.report import Finding, Reading, StabilityReport
 from gsim3d.ops._arguments import check_floating, check_real, check_tensors, check_whole, within_memory
@@ -246,9 +246,8 @@ def _check_choices(
     check_on_invalid(on_invalid)
     if (sh is None) == (colors is None):
         raise ValueError(f"{OP}: give one of sh and colors")
-    for name, value, known in (("cutoff", cutoff, CUTOFFS), ("jacobian", jacobian, JACOBIANS)):
-        if not isinstance(value, str) or value not in known:
-            raise ValueError(f"{OP}: {name} must be one of {', '.join(known)}; got {value!r}")
+    check_one_of(f"{OP}: cutoff", cutoff, CUTOFFS)
+    check_one_of(f"{OP}: jacobian", jacobian, JACOBIANS)
     name, color, shape = ("sh", sh, "[N, K, 3]") if colors is None else ("colors", colors, "[N, 3]")
     if color.dim() != shape.count(",") + 1:
         raise ValueError(f"{OP}: {name} must be {shape}; got {list(color.shape)}")

@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from gsim3d.errors import check_one_of
 from gsim3d.ops._arguments import check_floating, check_numbers, check_tensors, check_whole, within_memory
 from gsim3d.ops._register import fakes, register_autocast, register_gradients
 from gsim3d.ops.raster import (
@@ -97,8 +98,7 @@ def _check(rows: dict[str, Tensor], optional: dict[str, Tensor], width: int, hei
     check_tensors(OP, **rows, **optional)
     check_floating(OP, means2d=rows["means2d"])
     check_whole(OP, width=width, height=height)
-    if cutoff not in ("exact", "smooth"):
-        raise ValueError(f"{OP}: cutoff must be one of exact, smooth; got {cutoff!r}")
+    check_one_of(f"{OP}: cutoff", cutoff, ("exact", "smooth"))
     n = rows["means2d"].shape[0] if rows["means2d"].dim() else 0
     shapes = {"means2d": (n, 2), "conics": (n, 3), "depths": (n,), "opacities": (n,), "absolute": (n, 2)}
     for name, value in (rows | optional).items():
@@ -114,9 +114,8 @@ def _check(rows: dict[str, Tensor], optional: dict[str, Tensor], width: int, hei
         raise ValueError(f"{OP}: cu_pairs must run from 0 to P={n} without descending; got {cu_pairs.tolist()}")
     n_images = 1 if cu_pairs is None else cu_pairs.shape[0] - 1
     if background is not None and background.shape not in ((colors.shape[1],), (n_images, colors.shape[1])):
-        raise ValueError(
-            f"{OP}: background must be [D={colors.shape[1]}] or [I={n_images}, D]; got {list(background.shape)}"
-        )
+        wanted = f"[D={colors.shape[1]}] or [I={n_images}, D]"
+        raise ValueError(f"{OP}: background must be {wanted}; got {list(background.shape)}")
     check_numbers(OP, largest_of=LARGEST, **rows)
 
 

@@ -34,17 +34,11 @@ Model = TypeVar("Model", bound=nn.Module)
 
 @dataclass(frozen=True)
 class Description:
-    """Parsed configuration of a checkpoint.
+    """Parsed configuration of a checkpoint."""
 
-    Attributes:
-        model: model configuration.
-        effects: effects that the model was trained to simulate.
-        inputs: input specification of the training; None if unknown.
-    """
-
-    model: ModelConfig
-    effects: EffectsSpec
-    inputs: InputSpec | None
+    model: ModelConfig  #: model configuration
+    effects: EffectsSpec  #: effects that the model was trained to simulate
+    inputs: InputSpec | None  #: input specification of the training; None if unknown
 
     def to_dict(self) -> dict[str, Any]:
         """Returns the content of a checkpoint's config.yaml."""
@@ -74,8 +68,7 @@ def load(
     except InputError as error:
         raise InputError(f"{name_or_path}: {error}") from None
     except Exception as error:  # an invalid configuration can raise any exception
-        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-        raise InputError(f"{name_or_path}: its configuration is not a valid model: {reason}") from None
+        raise InputError(f"{name_or_path}: its configuration is not a valid model: {_line_of(error)}") from None
     asymmetric = simulator.config.dynamics.is_asymmetric
     simulator.effects, simulator.setting = setting.of_effects(found.effects, asymmetric), setting
     simulator.inputs = setting.of_inputs(found.inputs)
@@ -99,16 +92,8 @@ def is_released(config: dict[str, Any]) -> bool:
 
 
 def describe(config: dict[str, Any], kind: type[ModelConfig] = ModelConfig, fps: float | None = None) -> Description:
-    """Parses a saved configuration.
-
-    Args:
-        config: content of a checkpoint's config.yaml.
-        kind: class of the model's configuration.
-        fps: default of frames per second.
-
-    Raises:
-        InputError: the configuration is invalid; the message names the key.
-    """
+    """Parses the content of a checkpoint's config.yaml; ``fps`` is the default of frames per second. Raises InputError,
+    which names the key, if it is invalid."""
     model = from_dict(kind, current_model(config["model"]), "model")
     effects = EffectsSpec.from_dict(config.get("effects", {}).get("spec"))
     names = {field.name for field in dataclasses.fields(InputSpec)}
@@ -135,21 +120,18 @@ def build(make: Callable[[ModelConfig], Model], config: ModelConfig, seed: int =
         except InputError:
             raise
         except Exception as error:  # invalid layer sizes can raise any exception
-            reason = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-            raise InputError(f"model: sizes are not valid: {reason}") from None
+            raise InputError(f"model: sizes are not valid: {_line_of(error)}") from None
+
+
+def _line_of(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
 
 
 def with_weights(
     make: Callable[[ModelConfig], Model], config: ModelConfig, effects: EffectsSpec, weights: dict[str, Tensor]
 ) -> Model:
-    """Builds a simulator with ``weights``.
-
-    Weights that ``effects`` do not use may be missing: they keep their initial values and are listed in
-    ``simulator.absent``.
-
-    Raises:
-        InputError: the weights do not fit the model.
-    """
+    """Builds a simulator with ``weights``. Those that ``effects`` do not use may be missing: they keep their initial
+    values and are listed in ``simulator.absent``. Raises InputError if the weights do not fit the model."""
     try:
         weights = current_weights(weights, config.dynamics)
         check_sizes(make, config, effects, weights)

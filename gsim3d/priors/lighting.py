@@ -74,14 +74,15 @@ class DirectionalLightConfig(PriorConfig):
 class _Light(Prior, ABC):
     """Multiplies the colours of a particle by its irradiance now over that at encoding.
 
-    For L lights, ``light_occlusion`` [N, n_columns] holds the values at encoding, then L current values. The features
-    are the last L and the first L columns. Sleeping particles keep their values.
+    For L lights, ``light_occlusion`` [N, n_values * L] holds the values at encoding, then L current values. The
+    features are the last L and the first L columns. Sleeping particles keep their values.
     """
 
     attributes = ("irradiance_gain",)
     n_gains = 3
     gains_change = "irradiance_gain"
     reads_background = True
+    n_values = 2
 
     def __init__(self, config: DirectionalLightConfig):
         super().__init__(config)
@@ -124,7 +125,7 @@ class _Light(Prior, ABC):
     def _updated(self, ctx: StepContext, known: Tensor | None) -> Tensor:
         n = len(self.config.directions)
         if ctx.is_empty:
-            return ctx.state.means.new_zeros(0, self.n_columns)
+            return ctx.state.means.new_zeros(0, self.n_values * n)
         began, now = self.occlusion(ctx, known)
         if known is not None:
             before = known[:, -n:]
@@ -140,10 +141,8 @@ class OcclusionLight(_Light):
 
     def __init__(self, config: DirectionalLightConfig):
         super().__init__(config)
-        directions = torch.tensor(config.directions)
-        self.n_columns = 2 * len(directions)
-        self.directions = nn.Parameter(config.unit * directions)
-        self.extinction = nn.Parameter(torch.full((len(directions), 3), config.strength))
+        self.directions = nn.Parameter(config.unit * torch.tensor(config.directions))
+        self.extinction = nn.Parameter(torch.full((len(self.directions), 3), config.strength))
 
     def occlusion(self, ctx: StepContext, known: Tensor | None) -> tuple[Tensor, Tensor]:
         now = optical_depth(ctx.movable, self.directions, ctx.grid_size, self.config.beam)
@@ -165,12 +164,12 @@ class LambertianLight(_Light):
     """Lambert's law with shadows: E = 1 + sum over lights of strength * v (n.l), with visibility v and normal n of the
     surface of a particle. The gain is E_now / E_encoding times the exponential of the predicted log gain."""
 
+    n_values = 3
+
     def __init__(self, config: DirectionalLightConfig):
         super().__init__(config)
-        directions = torch.tensor(config.directions)
-        self.n_columns = 3 * len(directions)
-        self.directions = nn.Parameter(config.unit * F.normalize(directions, dim=1))
-        self.strength = nn.Parameter(torch.full((len(directions), 3), config.strength))
+        self.directions = nn.Parameter(config.unit * F.normalize(torch.tensor(config.directions), dim=1))
+        self.strength = nn.Parameter(torch.full((len(self.directions), 3), config.strength))
 
     def occlusion(self, ctx: StepContext, known: Tensor | None) -> tuple[Tensor, Tensor]:
         n = len(self.directions)

@@ -29,14 +29,16 @@ def test_edges_join_all_nodes_of_cells_that_touch(sizes, earlier):
     graph, n = Graph.of(stage, 4, torch.zeros(1), earlier=earlier), stage.n_rows
     number = torch.arange(n, dtype=torch.float64)[:, None]
     listed = graph.receivers.cu_rows[-1]
-    ends = [x[:listed, 0].long() for x in (graph.from_senders(number), graph.from_receivers(number))]
+    ends = [
+        x[:listed, 0].long() for x in (graph.at_edges(number, graph.senders), graph.at_edges(number, graph.receivers))
+    ]
     found = list(zip(*(x.tolist() for x in ends), (4 * graph.age[:listed, 0]).tolist(), strict=True))
     age = 3 - stage.time_index if stage.time_index is not None else torch.zeros(n)
     near = (stage.grid[:, None] - stage.grid).abs().amax(-1) <= 1
     near &= (stage.cloud[:, None] == stage.cloud) & (age == 0) & ((age[:, None] > 0) == earlier)
     expected = [(s, r, float(age[s])) for s, r in near.nonzero().tolist()]
     assert sorted(found) == sorted(expected) and (len(expected) > n / len(sizes) or (earlier and len(sizes) == 1))
-    assert graph.from_senders(number)[listed:].eq(0).all()
+    assert graph.at_edges(number, graph.senders)[listed:].eq(0).all()
 
 
 def test_scenes_of_a_batch_equal_each_alone():

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from gsim3d.errors import InputError, check_ranges, did_you_mean
+from gsim3d.errors import InputError, check_one_of, check_ranges
 from gsim3d.nn.vision_transformer import Architecture
 
 _SMALL, _BASE = (384, 6, 12), (768, 12, 12)  # channels, heads, blocks
@@ -25,30 +25,24 @@ BACKBONES = {
 
 @dataclass(frozen=True)
 class ViTConfig:
-    """A vision transformer with dense prediction heads for depth and latents.
+    """A vision transformer with dense prediction heads for depth and latents."""
 
-    Attributes:
-        model: one of BACKBONES: "depth_anything_small" and "depth_anything_base" attend over all views and know the
-            cameras; "dinov2_small", "dinov2_base", and of timm "dinov3_small", "dinov3_base", see each view alone;
-            "tiny" is for tests.
-        image_size: pixels of the longer side at which the network reads images, rounded to whole patches; depth and
-            features are brought back to the size of the image.
-        frozen: which parts keep their weights: "none", "backbone" (with the camera encoder), or "depth" (also the depth
-            head; the scale of depth, the features and the particles' heads learn).
-        feature_dim: F, channels of the second head.
-        min_confidence: pixels with a lower confidence are transparent; 1: none. Needs a model that mixes views.
-    """
-
+    #: one of BACKBONES: "depth_anything_small" and "depth_anything_base" attend over all views and know the cameras;
+    #: "dinov2_small", "dinov2_base", and of timm "dinov3_small", "dinov3_base", see each view alone; "tiny" is for
+    #: tests
     model: str = "depth_anything_small"
+    #: pixels of the longer side at which the network reads images, rounded to whole patches; depth and features are
+    #: brought back to the size of the image
     image_size: int = 252
+    #: which parts keep their weights: "none", "backbone" (with the camera encoder), or "depth" (also the depth head;
+    #: the scale of depth, the features and the particles' heads learn)
     frozen: Literal["none", "backbone", "depth"] = "backbone"
-    feature_dim: int = 32
+    feature_dim: int = 32  #: F, channels of the second head
+    #: pixels with a lower confidence are transparent; 1: none. Needs a model that mixes views.
     min_confidence: float = 1.0
 
     def __post_init__(self):
-        if self.model not in BACKBONES:
-            known = f"must be one of {', '.join(BACKBONES)}; got {str(self.model)[:100]!r}"
-            raise InputError(f"ViTConfig: model {known}{did_you_mean(self.model, BACKBONES)}")
+        check_one_of("ViTConfig: model", self.model, BACKBONES)
         check_ranges(self, image_size=(1, 10**4), feature_dim=(1, 10**4), min_confidence=(1, 1e9))
         if self.min_confidence > 1 and self.architecture.mixes_from is None:
             raise InputError(f"ViTConfig: min_confidence must be 1: {self.model} predicts no confidence")
@@ -63,57 +57,37 @@ class EncoderConfig:
     """Sizes of the inverse renderer; the defaults are the paper's.
 
     With ``backbone: vit_dpt`` only ``vit``, ``dynamic_dim`` and what follows it have an effect.
-
-    Attributes:
-        feature_dim: C, channels of the multi-view features; a multiple of 4.
-        downscale_factor: s, image pixels a feature pixel along each axis: 2, 4 or 8.
-        cnn_dims: channels of the CNN's levels at strides 2, 4, 8 ... until s is reached, then at s.
-        cnn_blocks: residual blocks of each level.
-        transformer_layers: layers of self- and cross-view attention.
-        transformer_mlp_ratio: hidden channels of their feed-forward parts over 2 C.
-        window_split: K; attention sees windows of 1/K of the feature map along each axis, shifted in every other layer.
-        n_depths: D, depth candidates between far and near, evenly spaced in disparity.
-        cost_unet_dim: channels of the U-Net on the cost volume.
-        cost_unet_levels: its resolutions.
-        cost_unet_attention: its downsampling factors at which views attend to each other.
-        refine_unet_dim, refine_unet_levels, refine_unet_attention: the same of the U-Net on full-resolution images.
-        upsampled_dim: channels of the features brought to full resolution; 0: feature_dim.
-        disparity_dim: hidden channels of the full-resolution disparity and opacity head.
-        dynamic_dim: channels of the latents that change with time.
-        static_dim: channels of those that do not.
-        condition_dim: hidden channels of the network that scales and shifts features by depth and viewing ray.
-        explicit: also predict rotation, scale and spherical harmonics of each particle.
-        sh_degree: degree of these harmonics.
-        scale_range: smallest and largest predicted scale, in tenths of a pixel's width plus height at its depth.
-        backbone: what predicts depth and features: "plane_sweep", a cost volume between the views, or "vit_dpt", a
-            vision transformer, which can start from published weights.
-        vit: its settings.
     """
 
-    feature_dim: int = 128
-    downscale_factor: int = 4
+    feature_dim: int = 128  #: C, channels of the multi-view features; a multiple of 4
+    downscale_factor: int = 4  #: s, image pixels a feature pixel along each axis: 2, 4 or 8
+    #: channels of the CNN's levels at strides 2, 4, 8 ... until s is reached, then at s.
     cnn_dims: tuple[int, ...] = (64, 96, 128)
-    cnn_blocks: int = 2
-    transformer_layers: int = 6
-    transformer_mlp_ratio: int = 4
+    cnn_blocks: int = 2  #: residual blocks of each level
+    transformer_layers: int = 6  #: layers of self- and cross-view attention
+    transformer_mlp_ratio: int = 4  #: hidden channels of their feed-forward parts over 2 C
+    #: K; attention sees windows of 1/K of the feature map along each axis, shifted in every other layer
     window_split: int = 2
-    n_depths: int = 64
-    cost_unet_dim: int = 128
-    cost_unet_levels: int = 3
-    cost_unet_attention: tuple[int, ...] = (4,)
-    refine_unet_dim: int = 32
-    refine_unet_levels: int = 5
-    refine_unet_attention: tuple[int, ...] = (16,)
-    upsampled_dim: int = 0
-    disparity_dim: int = 64
-    dynamic_dim: int = 32
-    static_dim: int = 32
-    condition_dim: int = 20
-    explicit: bool = False
-    sh_degree: int = 3
+    n_depths: int = 64  #: D, depth candidates between far and near, evenly spaced in disparity
+    cost_unet_dim: int = 128  #: channels of the U-Net on the cost volume
+    cost_unet_levels: int = 3  #: its resolutions
+    cost_unet_attention: tuple[int, ...] = (4,)  #: its downsampling factors at which views attend to each other
+    refine_unet_dim: int = 32  #: as ``cost_unet_dim``, of the U-Net on full-resolution images
+    refine_unet_levels: int = 5  #: its resolutions
+    refine_unet_attention: tuple[int, ...] = (16,)  #: its downsampling factors at which views attend to each other
+    upsampled_dim: int = 0  #: channels of the features brought to full resolution; 0: feature_dim
+    disparity_dim: int = 64  #: hidden channels of the full-resolution disparity and opacity head
+    dynamic_dim: int = 32  #: channels of the latents that change with time
+    static_dim: int = 32  #: channels of those that do not
+    condition_dim: int = 20  #: hidden channels of the network that scales and shifts features by depth and viewing ray
+    explicit: bool = False  #: also predict rotation, scale and spherical harmonics of each particle
+    sh_degree: int = 3  #: degree of these harmonics
+    #: smallest and largest predicted scale, in tenths of a pixel's width plus height at its depth
     scale_range: tuple[float, float] = (0.5, 15.0)
+    #: what predicts depth and features: "plane_sweep", a cost volume between the views, or "vit_dpt", a vision
+    #: transformer, which can start from published weights
     backbone: Literal["plane_sweep", "vit_dpt"] = "plane_sweep"
-    vit: ViTConfig = ViTConfig()
+    vit: ViTConfig = ViTConfig()  #: its settings
 
     def __post_init__(self):
         if self.downscale_factor not in (2, 4, 8) or self.downscale_factor > 2 ** len(self.cnn_dims):

@@ -25,42 +25,25 @@ INITIAL_OUTPUT = 0.01  # scale of the untrained disparity correction and opacity
 
 @dataclass(frozen=True)
 class Views:
-    """Images and cameras of n clouds with V views each; I = n * V, views of one cloud one after another.
+    """Images and cameras of n clouds with V views each; I = n * V, views of one cloud one after another."""
 
-    Attributes:
-        images: [I, 3, H, W] in [0, 1].
-        Ks: [I, 3, 3] float64 pixels.
-        viewmats: [I, 4, 4] float64 world-to-camera.
-        near: [I] metres.
-        far: [I] metres.
-        n_views: V.
-        geometry: what follows from the cameras; None: made where it is needed.
-        features: of a frozen backbone; None: made where they are needed.
-    """
-
-    images: Tensor
-    Ks: Tensor
-    viewmats: Tensor
-    near: Tensor
-    far: Tensor
-    n_views: int
-    geometry: ViewGeometry | None = None
-    features: Tensor | None = None
+    images: Tensor  #: [I, 3, H, W] in [0, 1]
+    Ks: Tensor  #: [I, 3, 3] float64 pixels
+    viewmats: Tensor  #: [I, 4, 4] float64 world-to-camera
+    near: Tensor  #: [I] metres
+    far: Tensor  #: [I] metres
+    n_views: int  #: V
+    geometry: ViewGeometry | None = None  #: what follows from the cameras; None: made where it is needed
+    features: Tensor | None = None  #: of a frozen backbone; None: made where they are needed
 
 
 @dataclass(frozen=True)
 class Depth:
-    """What is predicted of every pixel.
+    """What is predicted of every pixel."""
 
-    Attributes:
-        depth: [I, 1, H, W] metres.
-        opacity_logit: [I, 1, H, W].
-        features: [I, F, H, W] for the heads.
-    """
-
-    depth: Tensor
-    opacity_logit: Tensor
-    features: Tensor
+    depth: Tensor  #: [I, 1, H, W] metres
+    opacity_logit: Tensor  #: [I, 1, H, W]
+    features: Tensor  #: [I, F, H, W] for the heads
 
 
 def upsampling_matrix(n: int, factor: int, stride: float, like: Tensor) -> Tensor:

@@ -92,13 +92,10 @@ class Encoder(nn.Module):
         Gradients:
             Flow to ``frames.images`` and the parameters; of convolutions as torch's own switch for them says.
         """
-        if shapes is not None:
-            with tf32_only_if_asked():
-                return self._encode_into(frames, shapes)
-        if check:
+        if check and shapes is None:
             self.check(frames)
         with tf32_only_if_asked():
-            return self._encode(frames)
+            return self._encode(frames) if shapes is None else self._encode_into(frames, shapes)
 
     @property
     def has_frozen_backbone(self) -> bool:

@@ -18,17 +18,11 @@ from gsim3d.nn.multiview_encoder.layout import for_convolution, two_convolutions
 
 @dataclass(frozen=True)
 class PixelRays:
-    """Viewing rays of pixels, made in float64.
+    """Viewing rays of pixels, made in float64."""
 
-    Attributes:
-        centers: [I, 3] of the cameras, world.
-        rotations: [I, 3, 3] of the cameras, camera-to-world.
-        inverse_Ks: [I, 3, 3].
-    """
-
-    centers: Tensor
-    rotations: Tensor
-    inverse_Ks: Tensor
+    centers: Tensor  #: [I, 3] of the cameras, world
+    rotations: Tensor  #: [I, 3, 3] of the cameras, camera-to-world
+    inverse_Ks: Tensor  #: [I, 3, 3]
 
     @classmethod
     def of(cls, views: Views) -> PixelRays:
@@ -72,25 +66,15 @@ class Conditioning(nn.Module):
 
 @dataclass(frozen=True)
 class PixelParticles:
-    """One particle a pixel, [I, H * W, .]; pixel (u, v) is particle v * W + u. Attributes as in Particles.
+    """One particle a pixel, [I, H * W, .]; pixel (u, v) is particle v * W + u. Attributes as in Particles."""
 
-    Attributes:
-        means: metres, world.
-        opacities: in (0, 1).
-        dynamic_latents: change with time.
-        static_latents: do not.
-        quats: only in explicit models.
-        scales: only in explicit models.
-        sh: only in explicit models.
-    """
-
-    means: Tensor
-    opacities: Tensor
-    dynamic_latents: Tensor
-    static_latents: Tensor
-    quats: Tensor | None = None
-    scales: Tensor | None = None
-    sh: Tensor | None = None
+    means: Tensor  #: metres, world
+    opacities: Tensor  #: in (0, 1)
+    dynamic_latents: Tensor  #: change with time
+    static_latents: Tensor  #: do not
+    quats: Tensor | None = None  #: only in explicit models
+    scales: Tensor | None = None  #: only in explicit models
+    sh: Tensor | None = None  #: only in explicit models
 
 
 class ParticleHeads(nn.Module):

@@ -14,16 +14,10 @@ from gsim3d.state import CloudTable
 
 @dataclass(frozen=True)
 class ViewGeometry:
-    """What follows from cameras alone, float64.
+    """What follows from cameras alone, float64; for a plane sweep, of all P pairs of views of a cloud."""
 
-    Attributes:
-        rays: of their pixels.
-        of_depth: what the prediction of depth makes of them: for a plane sweep homographies [P, 3, 3] and translations
-            [P, 3] between the feature maps of all pairs of views of a cloud.
-    """
-
-    rays: PixelRays
-    of_depth: tuple[Tensor, ...]
+    rays: PixelRays  #: of their pixels
+    of_depth: tuple[Tensor, ...]  #: what the prediction of depth reads: homographies [P, 3, 3], translations [P, 3]
 
     def tensors(self) -> list[Tensor]:
         return [*vars(self.rays).values(), *self.of_depth]
@@ -31,16 +25,11 @@ class ViewGeometry:
 
 @dataclass(frozen=True)
 class StaticShapes:
-    """Where the particles of frames go, and what depends on their cameras; of ``Encoder.static_shapes``.
+    """Where the particles of frames go, and what depends on their cameras; of ``Encoder.static_shapes``. Padding,
+    which sleeps, follows the pixels that become particles."""
 
-    Attributes:
-        clouds: as many particles in each cloud as in any other; padding, which sleeps, follows the pixels that become
-            particles.
-        geometry: of the cameras.
-    """
-
-    clouds: CloudTable
-    geometry: ViewGeometry
+    clouds: CloudTable  #: as many particles in each cloud as in any other
+    geometry: ViewGeometry  #: of the cameras
 
     @property
     def size(self) -> int:
@@ -55,17 +44,11 @@ class StaticShapes:
 
 @dataclass(frozen=True)
 class PixelIndex:
-    """Which pixel of [Q * P] becomes which particle of [Q * R].
+    """Which pixel of [Q * P] becomes which particle of [Q * R]."""
 
-    Attributes:
-        pixel: int64, of each particle; any of padding.
-        exists: bool, of each particle, False of padding.
-        particle: int64, of each pixel; Q * R where it becomes none.
-    """
-
-    pixel: Tensor
-    exists: Tensor
-    particle: Tensor
+    pixel: Tensor  #: int64, of each particle; any of padding
+    exists: Tensor  #: bool, of each particle, False of padding
+    particle: Tensor  #: int64, of each pixel; Q * R where it becomes none
 
     @classmethod
     def of(cls, frames: Frames, shapes: StaticShapes) -> PixelIndex:
