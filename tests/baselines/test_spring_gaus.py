@@ -56,6 +56,30 @@ def test_a_fit_falls_as_the_body_does(data, quick):
     assert made[0].losses[-1] < 0.05 and made[0].velocity.abs().max() > 0
 
 
+def test_what_it_simulated_is_recovered(data, quick, monkeypatch):
+    scene, cams = Scene.open(find_scenes(data)[0]), (0, 3, 5, 9)
+    config = dataclasses.replace(QUICK, velocity_iterations=45, dynamic_iterations=12, more_substeps=0)
+    start = spring_gaus.Fit(scene, cams, 2, QUICK, torch.device("cpu"))
+    start.velocity, start.height = torch.tensor([0.04, -0.03, 0.02]), -9.0
+    falling = start.with_dynamics(4, dataclasses.replace(config, dynamic_iterations=0))
+    start.height = float(start.springs.rest[:, 2].min()) + 0.02  # in contact from the first frame on
+    landing = start.with_dynamics(8, dataclasses.replace(config, dynamic_iterations=0, stiffness=500.0))
+    frames = {4: falling.images(cams, range(4)), 8: landing.images(cams, range(8))}
+
+    def load(self, count):
+        self._generator = torch.Generator().manual_seed(1)
+        self._cameras = [scene.cameras_at(cams, [step]) for step in range(count)]
+        self._objects = frames[count]
+
+    monkeypatch.setattr(spring_gaus.Fit, "_load", load)
+    fit = start.with_dynamics(8, config)
+    assert 2.69 < fit.stiffness.mean() < 2.99 and sum(fit.losses[-4:]) < 0.95 * sum(fit.losses[:4])
+    start.config, start.height, start.velocity = config, -9.0, torch.zeros(3, requires_grad=True)
+    start._load(4)
+    start._fit_velocity(0.0)
+    assert (start.velocity - falling.velocity).norm() < 0.02 * falling.velocity.norm()
+
+
 def test_evaluate_scores_baselines_without_a_checkpoint(data, quick, tmp_path):
     out = tmp_path / "metrics.json"
     given = {"given": 4, "steps": 4, "cameras": TARGETS, "scenes": "all", "metrics": ["psnr", "psnr_body"]}
