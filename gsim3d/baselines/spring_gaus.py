@@ -124,6 +124,13 @@ class SpringGaus:
         """Returns the same images of the object alone, on black."""
         return _as_bytes(self._fit(scene, cams, n_encoded).images(cams, range(n_encoded, n_encoded + n_future)))
 
+    def found(self) -> dict:
+        """Returns what the last fit found, and in how many substeps a frame: friction acts in each."""
+        fit = self._last[1]
+        numbers = {"stiffness": 10 ** fit.stiffness.mean(), "grip": friction(fit._friction), "softness": fit._softness}
+        found = {name: value.item() for name, value in numbers.items()}
+        return {"substeps": fit.substeps, "velocity": fit.velocity.tolist(), **found}
+
     def _fit(self, scene: Scene, cams: Sequence[int], n_encoded: int) -> Fit:
         wanted = self.config.fit_frames
         count = n_encoded if wanted is None else min(wanted or scene.n_steps, scene.n_steps)

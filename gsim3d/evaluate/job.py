@@ -1,7 +1,7 @@
 """Implementation of ``gsim3d evaluate``: scores a checkpoint and predictions of other models, and writes a report."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from gsim3d.baselines import baseline
@@ -103,6 +103,7 @@ def _evaluate(job: Job, metrics: tuple, not_measured: dict, against: dict | None
         "effects": None if restored is None else restored.plan.spec.hash,
         "predictions": {other.name: str(other.folder) for other in others},
         "not_applicable": not_applicable,
+        "fitted": {other.name: asdict(other.config) for other in fitted},
         "data": str(job.data),
         "split": job.split,
         "fps": sorted({scene.fps for scene in scenes}),

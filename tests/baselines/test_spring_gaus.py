@@ -87,7 +87,7 @@ def test_evaluate_scores_baselines_without_a_checkpoint(data, quick, tmp_path):
     report = json.loads(out.read_text())
     assert report["not_applicable"] == {} and "spring-gaus" in report["predictions"]
     assert report["spring-gaus.future.psnr"] > 18 and report["spring-gaus-object.future.psnr"] > 12
-    assert "spring-gaus-object.future.psnr_body" not in report
+    assert "spring-gaus-object.future.psnr_body" not in report and report["fitted"]["spring-gaus"]["anchors"] == 64
 
 
 def test_where_it_does_not_apply_it_says_why(data, quick, tmp_path, monkeypatch, capsys):

@@ -1,6 +1,7 @@
 """The page of the paper's tables: measured within a budget, continued, compared with the last run."""
 
 import dataclasses
+import json
 import shutil
 
 import pytest
@@ -158,6 +159,8 @@ def test_fitted_methods_are_rows(work, tmp_path, monkeypatch, no_curves):
     row = lines[MAIN, "spring-gaus"]
     assert row["numbers"]["future.psnr_masked"] > 10 and row["seed"] is None
     assert row["numbers"].keys() <= lines[MAIN, "copy"]["numbers"].keys()
+    cell = json.loads(next((tmp_path / "out" / "cells").rglob("spring-gaus/*.json")).read_text())
+    assert cell["result"]["found"]["substeps"] >= 5 and len(cell["result"]["found"]["velocity"]) == 3
     alone = lines[MAIN, "spring-gaus-object"]
     assert {"future.psnr", "future.ssim"} == alone["numbers"].keys() and not alone["by_scene"]
 
