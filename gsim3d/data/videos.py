@@ -39,7 +39,7 @@ FILE = "cameras.json"
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".webm", ".mov", ".avi", ".m4v")
 SHARED_KEYS = ("fps", "resample", "units", "near", "far", "origin", "bounds", "masks", "pixel_center", "cameras")
 KEYS = (*SHARED_KEYS, "name", "size", "K", "R", "T", "offset", "distortion", "camera_model", "is_fisheye")
-NEAR_NAME = 0.8  # similarity of a key to a known one, above which it is taken for a typing error
+NEAR_NAME, MAX_OTHERS = 0.8, 100  # similarity at which a key is taken for a misspelt one, and keys that are compared
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 DISTORTIONS = [(4,), (5,), (8,)]
 OWN_FOLDERS = ("masks", "labels")  # reserved, not camera names
@@ -119,7 +119,7 @@ def _entries(description: Description) -> dict[str, Description]:
         values, where = {**shared, **entry}, f"{description.where}camera {name}: "
         if misplaced := next((key for key in SHARED_KEYS if key in entry), None):
             raise InputError(f"{where}{misplaced} belongs to the top level: all cameras have the same")
-        for key in set(values).difference(KEYS):
+        for key in sorted(set(values).difference(KEYS))[:MAX_OTHERS]:
             if meant := difflib.get_close_matches(key[:100], KEYS, 1, NEAR_NAME):
                 raise InputError(f"{where}{key:.80} is no key of this file; did you mean {meant[0]}?")
         found[name] = Description(values, where, description.problems)

@@ -1,5 +1,6 @@
 """Text that is safe on a terminal, and progress with the time left."""
 
+import errno
 import os
 import re
 from collections.abc import Callable
@@ -17,8 +18,8 @@ def plain(text: str) -> str:
 class Terminal:
     """A text stream whose text is :func:`plain`, whatever names of files are in it.
 
-    A carriage return passes at the begin of a text: progress bars write them. Once a pipe has no reader, what is
-    written to it is lost, and the command goes on.
+    A carriage return passes at the begin of a text: progress bars write them. Once a pipe has no reader or the
+    terminal is gone, what is written is lost, and the command goes on.
     """
 
     def __init__(self, stream: Any):
@@ -39,7 +40,9 @@ class Terminal:
             return
         try:
             action()
-        except BrokenPipeError:
+        except OSError as error:
+            if error.errno not in (errno.EPIPE, errno.EIO):
+                raise
             self._is_open = False
             with open(os.devnull, "wb") as nothing:  # where what Python still holds goes at the end
                 os.dup2(nothing.fileno(), self._stream.fileno())

@@ -12,12 +12,12 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 
 from gsim3d.errors import RunStopped
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
 TWICE = 2.0  # seconds; a signal repeated within them is one that the launcher forwards
 INTERVAL = 2.0  # seconds between heartbeats
 SILENCE = 40.0  # seconds without heartbeat after which a process is lost; loading a library can block it for long
@@ -29,9 +29,10 @@ _ALIVE, _LEFT = -1, -2
 
 @contextmanager
 def noted_signals() -> Iterator[list[int]]:
-    """Context that records SIGINT, SIGTERM and SIGUSR1 in the yielded list instead of ending the process.
+    """Context that records SIGNALS in the yielded list instead of ending the process.
 
-    A second SIGINT raises KeyboardInterrupt. Outside of the main thread nothing is recorded.
+    Ignored ones (nohup, jobs in the background of a script) stay ignored. A second SIGINT raises KeyboardInterrupt.
+    Outside of the main thread nothing is recorded.
     """
     noted: list[int] = []
     if threading.current_thread() is not threading.main_thread():
@@ -44,12 +45,14 @@ def noted_signals() -> Iterator[list[int]]:
         if not noted:
             first = time.monotonic()
             text = f"\ngsim3d: {signal.Signals(number).name}: stopping after this step, with a checkpoint\n"
-            os.write(2, text.encode())  # print is not reentrant
+            with suppress(OSError):  # the terminal is gone
+                os.write(2, text.encode())  # print is not reentrant
         elif number == signal.SIGINT and time.monotonic() - first > TWICE:
             raise KeyboardInterrupt
         noted.append(number)
 
-    before = {number: signal.signal(number, note) for number in SIGNALS}
+    heard = [number for number in SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
+    before = {number: signal.signal(number, note) for number in heard}
     try:
         yield noted
     finally:

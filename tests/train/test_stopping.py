@@ -1,9 +1,11 @@
 """Runs that are asked to end save first; runs whose launcher or partner is gone end with one line."""
 
+import dataclasses
 import os
 import signal
 import subprocess
 import sys
+import termios
 import time
 from pathlib import Path
 
@@ -25,7 +27,7 @@ from tests.two_processes import free_port
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +63,32 @@ def test_signal_saves_and_resumed_run_equals_uninterrupted(folder, tmp_path, cap
     Trainer(CONFIG, scenes(folder), tmp_path / "parts").run(progress=False)
     assert curve(tmp_path / "parts") == curve(tmp_path / "whole")
     assert_same_checkpoint(tmp_path / "parts", tmp_path / "whole")
+
+
+def test_ignored_signals_stay_ignored(folder, tmp_path):
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as under nohup
+    try:
+        signalled(Trainer(CONFIG, scenes(folder), tmp_path), 0, signal.SIGHUP).run(until=2, progress=False)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert checkpoint.load(tmp_path).state["step"] == 2
+
+
+def test_run_saves_when_its_terminal_is_gone(folder, tmp_path):
+    config, inner, outer = tmp_path / "train.yaml", *os.openpty()
+    termios.tcsetwinsize(outer, (24, 80))
+    endless = dataclasses.replace(CONFIG.phases[0], steps=100_000)
+    config.write_text(yaml.safe_dump(to_dict(dataclasses.replace(CONFIG, phases=(endless,)))))
+    command = [sys.executable, "-m", "gsim3d", "train", config, "--data", folder, "--out", tmp_path / "run"]
+    run = subprocess.Popen(command, stdin=outer, stdout=outer, stderr=outer, start_new_session=True)
+    os.close(outer)
+    said = b""
+    while b" 2/100000" not in said:
+        said += os.read(inner, 4096)
+    os.close(inner)  # whatever is written from here on is an error
+    run.send_signal(signal.SIGHUP)
+    assert run.wait(timeout=60) == 128 + signal.SIGHUP
+    assert checkpoint.load(tmp_path / "run").state["step"] > 0
 
 
 def test_signal_in_last_step_raises_nothing(folder, tmp_path):
