@@ -13,7 +13,6 @@ OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 FISHEYE_ORDER = ("k1", "k2", "k3", "k4")
 PARAMS_ORDER = ("k1", "k2", "k3", "k4", "p1", "p2")  # of the key distortion_params
 READ = (*COEFFICIENTS, "distortion_params", "camera_model", "is_fisheye")
-UNSET = ("", "none", "no", "false", "0", "0.0", "-0.0")  # keys with these values say nothing
 PERSPECTIVE = {
     "PINHOLE": (),
     "SIMPLE_PINHOLE": (),
@@ -102,7 +101,7 @@ def _is_set(value) -> bool:
     if isinstance(value, (list, dict)):
         items = value.values() if isinstance(value, dict) else value
         return any(isinstance(item, (list, dict)) or _is_set(item) for item in items)
-    return str(value).lower() not in UNSET
+    return str(value).lower() not in ("", "none", "no", "false", "0", "0.0", "-0.0")
 
 
 def _coefficients(values: Mapping, what: str, problems: Problems) -> dict[str, float]:

@@ -18,8 +18,7 @@ from gsim3d.state import Gaussians
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 MAX_BYTES = 2**36  # of a file: 10^8 Gaussians and more
 SMALLEST_SCALE = 1e-9  # metres; keeps the logarithm finite and is far below a pixel
-FAR = 1000  # times the extent (of 1 m or more), the distance from the origin beyond which float32 is too coarse
-SKEW = 1e-4  # tolerance of a transform that turns and scales alike along all axes
+FAR, SKEW = 1000, 1e-4  # distance too far for float32, times the extent; tolerance of rotations in transforms
 HALF_TURN = 0.5**0.5
 # Rotations (w, x, y, z) from axes with z up to axes with y up, and back.
 Z_TO_Y_UP, Y_TO_Z_UP = (HALF_TURN, -HALF_TURN, 0.0, 0.0), (HALF_TURN, HALF_TURN, 0.0, 0.0)

@@ -148,8 +148,7 @@ def read_splats(path: str | Path, *, up: str | None = None) -> Gaussians:
 
 
 def _turned(gaussians: Gaussians, turn: tuple, path: Path) -> Gaussians:
-    offset = gaussians.world_offset
-    offset = None if offset is None else offset @ torch.from_numpy(turn_matrix(turn)).T
+    offset = None if gaussians.world_offset is None else gaussians.world_offset @ torch.from_numpy(turn_matrix(turn)).T
     return dataclasses.replace(gaussians_of(turned(splats_of(gaussians, None, path), turn), path), world_offset=offset)
 
 

@@ -20,8 +20,7 @@ EXTENSION = "KHR_gaussian_splatting"
 MAGIC, JSON_CHUNK, BIN_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
 FLOAT, UBYTE, POINTS = 5126, 5121, 0
 MOST_JSON = 2**26  # bytes
-DEGREES = 4
-MAX_NODES = 1000
+DEGREES, MAX_NODES = 4, 1000
 
 
 def write(path: Path, splats: Splats) -> None:

@@ -17,7 +17,6 @@ from gsim3d.io.files import read_file
 SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 MAX_MESH, MAX_TEXTURE = 1 << 28, 1 << 28  # largest file in bytes
 SLOTS = 3  # largest number of channels of a corner
-SURFACES = ("curv", "curv2", "surf")  # keywords of free-form geometry in OBJ files
 CHANGES = ("-s", "-o", "-t", "-mm", "-clamp", "-imfchan")  # options of map_Kd that change the picture, unless ...
 UNCHANGED = re.compile(r"-s( 1(\.0*)?)+|-[ot]( 0(\.0*)?)+|-mm 0 1|-clamp off")
 READ_EXTENSIONS = rb"KHR_(?:materials_\w+|lights_punctual)"
@@ -128,7 +127,7 @@ def _read_obj(path: Path, data: bytes) -> list[Piece]:
                 material = rest.strip()
             elif key == "mtllib":
                 libraries.append(rest.strip())
-            elif key in SURFACES:
+            elif key in ("curv", "curv2", "surf"):
                 raise ValueError(f"{key}: free-form geometry is not supported; convert it to polygons")
         except (ValueError, IndexError) as error:
             raise InputError(f"mesh {path} cannot be read: line {number}: {str(error)[:100]}") from None

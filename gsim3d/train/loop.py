@@ -170,7 +170,7 @@ class Trainer:
 
         Raises:
             NumericalError: ``optimizer.max_skipped`` consecutive steps were skipped.
-            RunStopped: saved and stopped before ``until``, because of a signal (SIGINT, SIGTERM, SIGUSR1, SIGHUP) or a lost launcher.
+            RunStopped: saved and stopped before ``until``, because of a signal or a lost launcher.
         """
         until = self.config.n_steps if until is None else min(until, self.config.n_steps)
         self.out.mkdir(parents=True, exist_ok=True)

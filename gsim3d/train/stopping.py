@@ -29,10 +29,9 @@ _ALIVE, _LEFT = -1, -2
 
 @contextmanager
 def noted_signals() -> Iterator[list[int]]:
-    """Context that records SIGNALS in the yielded list instead of ending the process.
+    """Context that records SIGNALS in the yielded list instead of ending the process; ignored ones stay ignored.
 
-    Ignored ones (nohup, jobs in the background of a script) stay ignored. A second SIGINT raises KeyboardInterrupt.
-    Outside of the main thread nothing is recorded.
+    A second SIGINT raises KeyboardInterrupt. Outside of the main thread nothing is recorded.
     """
     noted: list[int] = []
     if threading.current_thread() is not threading.main_thread():
