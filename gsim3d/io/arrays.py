@@ -77,6 +77,12 @@ def span_of(gaussians: Gaussians, frame: int | None) -> slice:
     return slice(None) if frame is None else slice(*gaussians.cu_rows[frame : frame + 2].tolist())
 
 
+def rows_of(gaussians: Gaussians, rows: slice | torch.Tensor) -> Gaussians:
+    """The ``rows`` of ``gaussians`` as one packed frame."""
+    fields = {name: getattr(gaussians, name)[rows] for name in FIELDS}
+    return dataclasses.replace(gaussians, **fields, cu_rows=torch.tensor([0, len(fields["means"])]))
+
+
 def gaussians_of(splats: Splats, path: Path) -> Gaussians:
     """``splats`` as one packed frame.
 

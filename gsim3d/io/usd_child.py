@@ -26,9 +26,10 @@ def main(file: str, out: str) -> None:
     """Writes what ``file`` holds to ``out``; the process ends where that takes too much time."""
     size = os.stat(file).st_size
     signal.alarm(SECONDS + size // BYTES_A_SECOND)
-    has = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    most, limit = has + MEMORY + MEMORY_A_BYTE * size, resource.getrlimit(resource.RLIMIT_AS)[1]
-    resource.setrlimit(resource.RLIMIT_AS, (most if limit == resource.RLIM_INFINITY else min(most, limit), limit))
+    if (statm := Path("/proc/self/statm")).is_file():  # Linux: begins with the pages that the process has
+        has = int(statm.read_text().split()[0]) * resource.getpagesize()
+        most, limit = has + MEMORY + MEMORY_A_BYTE * size, resource.getrlimit(resource.RLIMIT_AS)[1]
+        resource.setrlimit(resource.RLIMIT_AS, (most if limit == resource.RLIM_INFINITY else min(most, limit), limit))
     try:
         found = read(file)
     except Exception as error:  # whatever a damaged file brings about

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsim3d.data import Scene
 from gsim3d.errors import FitWarning, InputError, did_you_mean
-from gsim3d.io.arrays import colors_of, dc_of, splats_of
+from gsim3d.io.arrays import colors_of, dc_of, rows_of, splats_of
 from gsim3d.io.files import new_output_path, with_parents
 from gsim3d.io.orbit import picture
 from gsim3d.io.video import write_video
@@ -265,10 +265,7 @@ class Target:
             changes["sh"] = torch.from_numpy(dc_of(self.colors(frame, layers.coloring).numpy()))[:, None]
         gaussians = dataclasses.replace(gaussians, **changes)
         rows = self.rows(frame, layers)
-        if bool(rows.all()):
-            return gaussians
-        fields = {name: getattr(gaussians, name)[rows] for name in ("means", "quats", "scales", "opacities", "sh")}
-        return dataclasses.replace(gaussians, **fields, cu_rows=torch.tensor([0, int(rows.sum())]))
+        return gaussians if bool(rows.all()) else rows_of(gaussians, rows)
 
     def rows(self, frame: int, layers: Layers) -> Tensor:
         """bool [N], the Gaussians of a frame that ``layers`` show."""

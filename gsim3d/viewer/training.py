@@ -1,13 +1,11 @@
 """A viewer of a training run: the newest sample prediction, uploaded by the viewer's own thread."""
 
-import dataclasses
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import pairwise
 
-import torch
-
+from gsim3d.io.arrays import rows_of
 from gsim3d.state import Gaussians, Particles, single_steps
 from gsim3d.train.log import Sample
 from gsim3d.viewer.live import Target
@@ -52,8 +50,5 @@ def showing_samples() -> Iterator[Callable[[Sample, int], None]]:
 def _frames(sample: Sample) -> tuple[list[Particles], list[Gaussians]]:
     """Particles and Gaussians of each step, on the CPU."""
     particles, gaussians = sample.particles.to("cpu"), sample.gaussians.to("cpu")
-    frames = []
-    for begin, end in pairwise(gaussians.cu_rows.tolist()):
-        fields = {name: getattr(gaussians, name)[begin:end] for name in ("means", "quats", "scales", "opacities", "sh")}
-        frames.append(dataclasses.replace(gaussians, **fields, cu_rows=torch.tensor([0, end - begin])))
-    return single_steps(particles), frames
+    spans = pairwise(gaussians.cu_rows.tolist())
+    return single_steps(particles), [rows_of(gaussians, slice(*span)) for span in spans]
