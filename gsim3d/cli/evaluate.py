@@ -67,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="NAME",
         help="methods that are fitted to each scene: spring-gaus (to 24 frames), spring-gaus-given (to the input "
-        "frames), spring-gaus-all (to the whole scene, as published); slow on a CPU",
+        "frames), spring-gaus-all (to the whole scene, as published); NAME-object is the object alone; slow on a CPU",
     )
     add("--given", type=whole(1), metavar="N", help="number of input steps of the other models (without CHECKPOINT)")
     add(

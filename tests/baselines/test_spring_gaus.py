@@ -56,6 +56,13 @@ def test_a_fit_falls_as_the_body_does(data, quick):
     assert made[0].losses[-1] < 0.05 and made[0].velocity.abs().max() > 0
 
 
+def test_a_gpu_fits_as_a_cpu_does(data, quick, devices):
+    scene, cams = Scene.open(find_scenes(data)[0]), (0, 3, 5, 9)
+    fits = [spring_gaus.Fit(scene, cams, 4, QUICK, torch.device(d)).with_dynamics(4, QUICK) for d in devices]
+    cpu, cuda = (fit.images([2], range(8), fit.ground).cpu() for fit in fits)
+    assert (cpu - cuda).abs().mean() < 0.01 and fits[1].losses[-1] == pytest.approx(fits[0].losses[-1], rel=0.2)
+
+
 def test_what_it_simulated_is_recovered(data, quick, monkeypatch):
     scene, cams = Scene.open(find_scenes(data)[0]), (0, 3, 5, 9)
     config = dataclasses.replace(QUICK, velocity_iterations=45, dynamic_iterations=12, more_substeps=0)
