@@ -47,12 +47,7 @@ class Splats:
 
 
 def splats_of(gaussians: Gaussians, frame: int | None, path: Path) -> Splats:
-    """One frame of ``gaussians`` to be written.
-
-    Args:
-        gaussians: packed frames.
-        frame: its number; None: all Gaussians as one frame.
-        path: for messages.
+    """One frame of packed ``gaussians`` to be written; None: all as one frame.
 
     Raises:
         InputError: a value is not finite, or there is no colour; the message names file and field.
@@ -173,14 +168,7 @@ def unorm(x: np.ndarray, bits: int) -> np.ndarray:
 
 
 def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations without their largest component.
-
-    Args:
-        quats: [N, 4] unit.
-
-    Returns:
-        [N] index of the largest component, and [N, 3] the others, of the quaternions whose largest is positive.
-    """
+    """[N] index of the largest component of unit ``quats`` [N, 4], and [N, 3] the others where it is made positive."""
     largest, index = np.abs(quats).argmax(1), np.arange(len(quats))
     signed = quats * np.where(quats[index, largest] < 0, -1, 1)[:, None]
     return largest.astype(np.uint32), np.stack([signed[index, k + (k >= largest)] for k in range(3)], 1)

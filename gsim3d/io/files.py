@@ -38,12 +38,9 @@ def new_output_path(out: str | Path, kind: str = "folder", option: str = "--out"
 
 
 def output_path(out: str | Path, suffix: str = "", option: str = "--out") -> Path:
-    """The path of a file that ends in ``suffix``, or of a folder, that a command will write.
+    """The path of a file that ends in ``suffix``, or of any file or folder, that a command will write.
 
-    Args:
-        out: path; folders around it need not exist.
-        suffix: ending of a file; empty: any file or folder.
-        option: name of the option, for messages.
+    Folders around it need not exist. ``option`` is named in messages.
 
     Raises:
         InputError: another ending, a folder in place of the file, or a file in place of a folder around it.
@@ -106,12 +103,7 @@ def opencv_path(path: str | Path) -> str:
 
 
 def read_file(path: str | Path, most: int, first: int | None = None) -> bytes:
-    """The bytes of a file.
-
-    Args:
-        path: a regular file.
-        most: bytes that it may have.
-        first: how many are read from its start; None: all.
+    """The bytes of a regular file, or its ``first`` bytes.
 
     Raises:
         InputError: it is missing, no file (pipes and devices are not opened), has more than ``most`` bytes, or cannot
@@ -133,11 +125,7 @@ def read_file(path: str | Path, most: int, first: int | None = None) -> bytes:
 
 
 def read_yaml(path: str | Path, kind: Any = dict) -> Any:
-    """Plain values of a YAML (or JSON) file.
-
-    Args:
-        path: of the file.
-        kind: what it must hold: ``dict``, ``list``, or ``dict | None`` where it may be empty.
+    """Plain values of a YAML (or JSON) file that holds ``kind``: dict, list, or ``dict | None`` where it may be empty.
 
     Raises:
         InputError: as :func:`read_file`, it is no YAML, or it holds something else; the message names it.

@@ -17,11 +17,10 @@ _held: set[Path] = set()  # folders that this process locked as a whole
 
 @contextmanager
 def only_one_writer(out: Path, parts: range | None = None) -> Iterator[None]:
-    """Locks a folder for this process, also where it is on a network file system.
+    """Locks an existing folder, or the numbered ``parts`` of it, for this process, also on a network file system.
 
-    Args:
-        out: the folder; it exists. Where this process has locked it already, nothing is done.
-        parts: numbers of the parts that are written, each of which other processes may not write; None: all.
+    Where this process has locked all of it already, nothing is done.
+
     Raises:
         InputError: another process writes there; the message has its number, if it locked the folder as a whole.
     """

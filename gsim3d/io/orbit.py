@@ -21,11 +21,7 @@ FAINT = 0.1  # opacity below which a Gaussian does not count for the view
 def orbit_frames(frames: Iterable[Gaussians], count: int, size: int, turns: float) -> Iterable[np.ndarray]:
     """Images uint8 [size, size, 3] of ``frames``, from a camera that turns about the vertical through their middle.
 
-    Args:
-        frames: one packed frame each, z up.
-        count: how many there are.
-        size: width and height of the images, pixels.
-        turns: of the camera, over all frames.
+    There are ``count`` frames, one packed frame each, z up; the camera makes ``turns`` over all of them.
     """
     reach = None
     for index, gaussians in enumerate(frames):

@@ -79,16 +79,7 @@ def read_header(path: Path, content: bytes) -> Header:
 
 
 def read_columns(path: Path, content: bytes, header: Header, *names: str) -> dict[str, dict[str, np.ndarray]]:
-    """The columns of elements, without their lists.
-
-    Args:
-        path: for messages.
-        content: of the file.
-        header: of the file.
-        names: of the elements that are needed, in any order.
-
-    Returns:
-        Element -> property -> [count] numbers; elements that the file has not are absent.
+    """Element -> property -> [count] numbers, of the elements ``names`` that the file has, without their lists.
 
     Raises:
         InputError: an element has no usable property, the file is truncated, or too many rows have lists.

@@ -37,9 +37,8 @@ def write_about(folder: Path, fps: float) -> None:
 def open_sequence(target: str | Path, up: str | None = None) -> Sequence:
     """The frames of ``target``: a file of Gaussians, a folder of such files, or a folder that has them in gaussians/.
 
-    Args:
-        target: file or folder.
-        up: axis that points up in the files (default: as their formats say).
+    ``up`` is the axis that points up in the files (default: as their formats say).
+
     Raises:
         InputError: there are none, or they are of several formats.
     """

@@ -15,10 +15,8 @@ WHITE, ACCENT = (255, 255, 255), (255, 157, 77)
 def film_frames(rows: Mapping[str, np.ndarray], fps: float, n_given: int = 0) -> Iterator[np.ndarray]:
     """Frames uint8 [H, W, 3] of even size: a row of panels for each label, a column a view, the time in seconds.
 
-    Args:
-        rows: label -> images uint8 [S, V, H, W, 3], all of one shape; small ones are enlarged to PANEL.
-        fps: images a second.
-        n_given: of the first images, the last row of which is labelled as given.
+    ``rows`` is label -> images uint8 [S, V, H, W, 3], all of one shape; small ones are enlarged to PANEL. The last
+    row of the first ``n_given`` is labelled as given.
     """
     n_steps, n_views, height, width = next(iter(rows.values())).shape[:4]
     scale = max(1.0, min(PANEL / height, (WIDEST / n_views - GAP) / width))

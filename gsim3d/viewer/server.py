@@ -60,12 +60,8 @@ class Viewer:
     def __init__(
         self, target: Target, simulation: Simulation | None = None, *, host: str = LOCAL, port: int = 0
     ) -> None:
-        """
-        Args:
-            target: what is shown.
-            simulation: that made it, to simulate on; None: the target cannot be changed.
-            host: address that the server listens at.
-            port: 0: a free one.
+        """Serves at ``host``; ``simulation`` made the target and simulates on. Port 0 is a free one.
+
         Raises:
             InputError: viser is not installed, the target is empty, or the port is taken.
         """
@@ -107,13 +103,7 @@ class Viewer:
             pass
 
     def show(self, particles: list[Particles], frames: list[Gaussians], note: str) -> None:
-        """Shows other frames of the same scene soon; returns at once.
-
-        Args:
-            particles: of each frame.
-            frames: their Gaussians.
-            note: shown before the time.
-        """
+        """Shows other frames of the same scene soon, and a note before the time; returns at once."""
         self._next.append((particles, frames, note))
 
     def _run(self) -> None:

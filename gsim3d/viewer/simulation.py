@@ -67,7 +67,6 @@ class Simulation:
     def __init__(self, restored: Restored, source: Scene | Particles, n_steps: int | None = None, start: int = 0):
         """
         Args:
-            restored: simulator.
             source: a scene that was opened by ``restored``, or the last steps of one, as particles of this model.
             n_steps: to predict; None: to the end of the recording, or 12 of particles.
             start: first input step of a scene.
@@ -158,12 +157,8 @@ class Simulation:
     def simulate_on(self, frame: int, n_steps: int, operations: Sequence[Operation] = ()) -> float:
         """Predicts the frames after ``frame`` anew, with the effects that are on; earlier edits stay, later ones go.
 
-        Args:
-            frame: the last that stays as it is.
-            n_steps: to predict after it.
-            operations: changes of the scene right after ``frame``.
-        Returns:
-            Seconds that a step took.
+        The scene changes by ``operations`` right after ``frame``. Returns the seconds that a step took.
+
         Raises:
             InputError: an operation cannot be made, and nothing has changed; or ``frame`` is not the last given or a
                 predicted one.
@@ -220,12 +215,7 @@ class Simulation:
         return [rows[label == one] for one in count.argsort(descending=True).tolist()]
 
     def box_of(self, frame: int, rows: Tensor) -> Box:
-        """Lowest and highest corner of a body in the steps that the model sees when it goes on after ``frame``.
-
-        Args:
-            frame: given or predicted.
-            rows: of :meth:`bodies` of this frame.
-        """
+        """Lowest and highest corner of a body of ``frame`` in the steps that the model goes on from after it."""
         points = [self.target.particles[frame].means[rows]]
         for before in range(frame - 1, max(-1, frame - self.effects.dynamics.history), -1):
             means, middle = self.target.particles[before].means, points[-1].mean(0)
@@ -283,12 +273,7 @@ class Simulation:
 
     @torch.no_grad()
     def costs(self, frame: int, progress: Callable[[float], object] = float) -> list[tuple[str, str, float]]:
-        """Effect, setting and milliseconds of a step on this machine, the other effects as they are now.
-
-        Args:
-            frame: whose next steps are timed.
-            progress: called with the share that is done.
-        """
+        """Effect, setting and milliseconds of a step after ``frame`` on this machine, other effects as they are now."""
         history = self._history(self._step_after(max(frame, self.target.n_encoded - 1)))
         switches = [switch for switch in self.switches() if len(switch.settings) > 1]
         specs = {spec.hash: spec for switch in switches for spec in switch.settings.values()}
