@@ -291,11 +291,10 @@ class Simulator(nn.Module):
         if plans is not None:
             if actors:
                 raise InputError("actors: scenes with plans of their own cannot have actors; give one plan")
-            options = {"generator": generator, "on_invalid": on_invalid, "report": report, "edits": edits, "log": log}
-            parts = [
-                self.rollout(state.select_clouds(clouds), n_steps, one, geometry=geometry, wrap=wrap, **options)
-                for one, clouds in by_plan(state, plans)
-            ]
+            options: dict[str, Any] = {"generator": generator, "on_invalid": on_invalid, "report": report}
+            options |= {"geometry": geometry, "wrap": wrap, "edits": edits, "log": log}
+            scenes = ((one, state.select_clouds(clouds)) for one, clouds in by_plan(state, plans))
+            parts = [self.rollout(some, n_steps, one, **options) for one, some in scenes]
             return [concatenate(step) for step in zip(*parts, strict=True)]
         if graph not in (None, "auto"):
             raise InputError(f'rollout: graph must be "auto" or None; got {graph!r}')

@@ -46,10 +46,8 @@ def _is_released(section: dict[str, Any]) -> bool:
             found |= {f"{name}.quirks.{key}": value for key, value in switches.items()}
     on = [name for name, value in found.items() if value is True]
     if on and len(on) < len(found):
-        raise InputError(
-            f"model.{on[0]}: on, but other quirks are off, which is not supported: import the published checkpoint "
-            "again (gsim3d import)"
-        )
+        advice = "import the published checkpoint again (gsim3d import)"
+        raise InputError(f"model.{on[0]}: on, but other quirks are off, which is not supported: {advice}")
     return bool(on)
 
 

@@ -145,11 +145,9 @@ def _change_basis(weights: dict[str, Tensor], config: ModelConfig, matrix: Tenso
     """Changes the basis of harmonics in the weights of the dynamics by ``matrix``."""
     layout = StateLayout.of(config.dynamics)
     wide = torch.block_diag(*[matrix] * 3)  # for channels (3, K)
-    for name, fields, axis, repeats in (
-        ("stem.conv.weight", layout.inputs, -1, 1),
-        ("head.fc2.weight", layout.outputs, 0, config.dynamics.steps_per_call),
-        ("head.fc2.bias", layout.outputs, 0, config.dynamics.steps_per_call),
-    ):
+    of_head = layout.outputs, 0, config.dynamics.steps_per_call
+    places = {"stem.conv.weight": (layout.inputs, -1, 1), "head.fc2.weight": of_head, "head.fc2.bias": of_head}
+    for name, (fields, axis, repeats) in places.items():
         names, widths = zip(*fields, strict=True)
         index = names.index("sh")
         after = weights[f"dynamics.net.{name}"].clone()

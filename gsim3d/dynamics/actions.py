@@ -39,15 +39,8 @@ class ActionParticles(nn.Module):
         self.displacement = nn.Parameter(torch.empty(3, channels).normal_(std=DISPLACEMENT))
 
     def added(self, history: Particles, acting: tuple[str, ...]) -> Particles:
-        """Returns ``history`` with the action particles of each cloud after its other particles.
-
-        Args:
-            history: clouds of scenes with actions.
-            acting: types of the points to add.
-
-        Raises:
-            InputError: the model does not know the type of a point.
-        """
+        """Returns ``history`` with the action particles, of the types ``acting``, of each cloud after its others.
+        Raises InputError if the model does not know the type of a point."""
         return joined_clouds(history, self._points(history, acting))
 
     @staticmethod

@@ -45,17 +45,13 @@ class RestLog:
 
 
 class Sleepers:
-    """Decides in each step which particles sleep.
+    """Decides by ``rule`` in each step which particles sleep: ``asleep``, bool [N]. At first all are awake.
 
     Args:
-        rule: policy and thresholds.
-        newest: initial particles, one cloud a scene, all awake.
+        newest: initial particles, one cloud a scene.
         grid_size: edge of a cell in metres.
         history: steps in the model's input. Particles fall asleep only if they were quiet in all of them.
         changing: attributes that a step may change; None: all predicted attributes.
-
-    Attributes:
-        asleep: bool [N], sleeping particles.
     """
 
     def __init__(
@@ -63,9 +59,8 @@ class Sleepers:
     ):
         self.rule, self.patience = rule, max(rule.patience, history)
         self.reach = rule.eps * grid_size
-        self.changing = (
-            {name for name in newest.row_fields() if ATTRIBUTES[name].predicted} if changing is None else set(changing)
-        )
+        predicted = {name for name in newest.row_fields() if ATTRIBUTES[name].predicted}
+        self.changing = predicted if changing is None else set(changing)
         self.asleep = torch.zeros(newest.n_rows, dtype=torch.bool, device=newest.means.device)
         self.any_asleep = False
         self.last_change = torch.zeros_like(self.asleep, dtype=torch.int64)  # step of the last change

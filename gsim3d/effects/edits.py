@@ -330,10 +330,8 @@ def _edit(values: Any, where: str, folder: Path, encode: Callable[[Path], Partic
 
 def _changed(state: Particles, chosen: Tensor, fields: dict[str, Tensor]) -> Particles:
     """Replaces attributes of the particles in the mask ``chosen`` (bool [N])."""
-    mixed = {
-        name: torch.where(chosen.reshape(-1, *[1] * (value.dim() - 1)), value, getattr(state, name))
-        for name, value in fields.items()
-    }
+    masks = {name: chosen.reshape(-1, *[1] * (value.dim() - 1)) for name, value in fields.items()}
+    mixed = {name: torch.where(masks[name], value, getattr(state, name)) for name, value in fields.items()}
     return dataclasses.replace(state, **mixed)
 
 

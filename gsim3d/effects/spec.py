@@ -31,18 +31,12 @@ class UnsupportedEffect(InputError):
 
 @dataclass(frozen=True)
 class Sleep:
-    """Sleep of particles at rest. See :mod:`gsim3d.dynamics.sleep`.
+    """Sleep of particles at rest. See :mod:`gsim3d.dynamics.sleep`."""
 
-    Attributes:
-        policy: "exact": whole scenes sleep; "approx": cubes of space sleep.
-        eps: largest change a step of a particle at rest: displacement along an axis in cells, and latents.
-        patience: steps at rest before a particle sleeps; at least the model's history is used.
-        halo: edge of the cubes in metres. Particles wake in time if velocities change by less than this a step.
-    """
-
-    policy: str = "exact"
-    eps: float = 1e-3
-    patience: int = 4
+    policy: str = "exact"  #: "exact": whole scenes sleep; "approx": cubes of space sleep
+    eps: float = 1e-3  #: largest change a step of a particle at rest: displacement along an axis in cells, and latents
+    patience: int = 4  #: steps at rest before a particle sleeps; at least the model's history is used
+    #: edge of the cubes in metres. Particles wake in time if velocities change by less than this a step.
     halo: float = 0.05
 
     def __post_init__(self):
@@ -55,21 +49,15 @@ class Sleep:
 
 @dataclass(frozen=True)
 class DynamicsEffects:
-    """Effects of the dynamics.
+    """Effects of the dynamics."""
 
-    Attributes:
-        background: "frozen": frozen particles never move, and others attend to them; "asymmetric": the same with a
-            model whose frozen particles attend only to each other, and are computed once a rollout; "masked_out":
-            frozen particles are removed; "dynamic": all particles may move.
-        history: steps in the model's input; None: as many as the model supports.
-        sleep: sleep of particles at rest; None: off.
-        actions: types of the points of actors that become action particles (:mod:`gsim3d.dynamics.actions`); empty:
-            off.
-    """
-
+    #: "frozen": frozen particles never move, and others attend to them; "asymmetric": the same with a model whose
+    #: frozen particles attend only to each other, and are computed once a rollout; "masked_out": frozen particles are
+    #: removed; "dynamic": all particles may move
     background: str = "frozen"
-    history: int | None = None
-    sleep: Sleep | None = None
+    history: int | None = None  #: steps in the model's input; None: as many as the model supports
+    sleep: Sleep | None = None  #: sleep of particles at rest; None: off
+    #: types of the points of actors that become action particles (:mod:`gsim3d.dynamics.actions`); empty: off
     actions: tuple[str, ...] = ()
 
     def __post_init__(self):
@@ -80,20 +68,15 @@ class DynamicsEffects:
 
 @dataclass(frozen=True)
 class AppearanceEffects:
-    """Effects of the appearance.
+    """Effects of the appearance."""
 
-    Attributes:
-        view_dependent: degree of the spherical harmonics, 0 to 3; None: the model's.
-        changing: particles whose dynamic latents change with time: "all", "dynamic", "frozen" (for example shadows on
-            the background) or "none".
-        opacity_changes: whether opacities change with time; None: if the model predicts them (explicit models).
-        frozen_appearance: selections whose latents stay constant, whatever ``changing`` is; resolved once at the start
-            of a rollout.
-    """
-
-    view_dependent: int | None = None
+    view_dependent: int | None = None  #: degree of the spherical harmonics, 0 to 3; None: the model's
+    #: particles whose dynamic latents change with time: "all", "dynamic", "frozen" (for example shadows on the
+    #: background) or "none"
     changing: str = "all"
+    #: whether opacities change with time; None: if the model predicts them (explicit models)
     opacity_changes: bool | None = None
+    #: selections whose latents stay constant, whatever ``changing`` is; resolved once at the start of a rollout
     frozen_appearance: tuple[Selection, ...] = ()
 
     def __post_init__(self):
@@ -106,32 +89,20 @@ class AppearanceEffects:
 
 @dataclass(frozen=True)
 class StructureEffects:
-    """Changes of the number of particles during a rollout (:mod:`gsim3d.effects.edits`).
+    """Changes of the number of particles during a rollout (:mod:`gsim3d.effects.edits`)."""
 
-    Attributes:
-        insert: whether edits may add particles.
-        remove: whether edits may remove particles.
-    """
-
-    insert: bool = False
-    remove: bool = False
+    insert: bool = False  #: whether edits may add particles
+    remove: bool = False  #: whether edits may remove particles
 
 
 @dataclass(frozen=True)
 class OutputEffects:
-    """Rendered images, all from one pass.
+    """Rendered images, all from one pass."""
 
-    Attributes:
-        rgb: colour.
-        depth: depth along the optical axis in metres.
-        alpha: coverage in [0, 1].
-        features: latents of the particles, blended as colours.
-    """
-
-    rgb: bool = True
-    depth: bool = False
-    alpha: bool = False
-    features: bool = False
+    rgb: bool = True  #: colour
+    depth: bool = False  #: depth along the optical axis in metres
+    alpha: bool = False  #: coverage in [0, 1]
+    features: bool = False  #: latents of the particles, blended as colours
 
 
 @dataclass(frozen=True)

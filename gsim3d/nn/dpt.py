@@ -63,14 +63,11 @@ class DPTHead(nn.Module):
         last = nn.Conv2d(LAST_DIM, n_out, 1)
         nn.init.normal_(last.weight, std=INITIAL_OUTPUT / LAST_DIM**0.5)
         nn.init.zeros_(last.bias)
-        self.scratch = nn.ModuleDict(
-            {
-                **{f"layer{i}_rn": nn.Conv2d(c, dim, 3, 1, 1, bias=False) for i, c in enumerate(channels, 1)},
-                **{f"refinenet{i}": Fusion(dim, is_first=i == 4) for i in (1, 2, 3, 4)},
-                "output_conv1": nn.Conv2d(dim, dim // 2, 3, 1, 1),
-                "output_conv2": nn.Sequential(nn.Conv2d(dim // 2, LAST_DIM, 3, 1, 1), nn.ReLU(), last),
-            }
-        )
+        parts = {f"layer{i}_rn": nn.Conv2d(c, dim, 3, 1, 1, bias=False) for i, c in enumerate(channels, 1)}
+        parts |= {f"refinenet{i}": Fusion(dim, is_first=i == 4) for i in (1, 2, 3, 4)}
+        parts["output_conv1"] = nn.Conv2d(dim, dim // 2, 3, 1, 1)
+        parts["output_conv2"] = nn.Sequential(nn.Conv2d(dim // 2, LAST_DIM, 3, 1, 1), nn.ReLU(), last)
+        self.scratch = nn.ModuleDict(parts)
 
     def forward(self, tokens: Tensor, grid: tuple[int, int], size: tuple[int, int]) -> Tensor:
         """grid: (h, w) of the patches; size: (H, W) of the result."""

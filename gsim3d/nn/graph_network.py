@@ -56,14 +56,8 @@ class Graph:
 
     @classmethod
     def of(cls, stage: Stage, longest: int, like: Tensor, *, earlier: bool) -> Graph:
-        """Joins the nodes of ``stage``, without a device sync.
-
-        Args:
-            stage: geometry of the nodes.
-            longest: steps of the longest history.
-            like: has the dtype of ``age``.
-            earlier: senders are the nodes of earlier steps, or else those of the newest.
-        """
+        """Joins the nodes of ``stage``, without a device sync. ``longest``: steps of the longest history; ``like``: has
+        the dtype of ``age``; ``earlier``: senders are the nodes of earlier steps, or else those of the newest."""
         voxels, taps = stage.voxels, stage.kernel_maps[KERNEL]
         cells = torch.arange(voxels.cu_rows.shape[0] - 1, device=like.device)
         node_at = _nodes_by_slot(stage, cells, longest if stage.time_index is not None else 1)

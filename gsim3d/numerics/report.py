@@ -45,9 +45,8 @@ class Finding:
 
     def error(self) -> NumericalError:
         """Returns the error of this finding, with advice."""
-        return NumericalError(
-            f"{self}; {ADVICE}", tensor=self.tensor, scene=self.scene, step=self.step, row=self.row, camera=self.camera
-        )
+        place = {name: getattr(self, name) for name in ("tensor", "scene", "step", "row", "camera")}
+        return NumericalError(f"{self}; {ADVICE}", **place)
 
 
 class Statistics(NamedTuple):
@@ -318,9 +317,8 @@ class StabilityReport:
         if not findings:
             return "nothing was raised, dropped, clamped or put to sleep"
         names = ("where", "tensor", "what", "action", "scene", "step", "camera", "row", "count")
-        rows = [names] + [
-            tuple("-" if (value := getattr(f, name)) is None else str(value) for name in names) for f in findings
-        ]
+        values = ([getattr(finding, name) for name in names] for finding in findings)
+        rows = [names, *(["-" if value is None else str(value) for value in row] for row in values)]
         widths = [max(len(row[c]) for row in rows) for c in range(len(names))]
         lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip() for row in rows]
         return "\n".join([*lines, f"total {self.total}"])

@@ -178,9 +178,8 @@ def without_oldest(frames: Frames, n_steps: int) -> Frames:
     names = ("images", "masks", "dynamic", "valid", "backbone_features")
     fields = {name: value[images] for name in names if (value := getattr(frames, name)) is not None}
     fields["cameras"] = cameras.select(images, number[cameras.image_cloud[images]])
-    return dataclasses.replace(
-        frames, **fields, cloud_scene=frames.cloud_scene[kept], cloud_step=frames.cloud_step[kept]
-    )
+    fields |= {name: getattr(frames, name)[kept] for name in ("cloud_scene", "cloud_step")}
+    return dataclasses.replace(frames, **fields)
 
 
 def variants(histories: Sequence[Particles]) -> Particles:

@@ -79,11 +79,9 @@ def validate_particles(
         Through valid particles. On the CPU, the backward pass raises if the gradient of an invalid particle is not
         finite, unless ``report`` is closed.
     """
-    fields = {
-        name: value
-        for name, value in particles.row_fields().items()
-        if ATTRIBUTES[name].validated and (changed is None or name in changed or name in ALWAYS)
-    }
+    fields = {name: value for name, value in particles.row_fields().items() if ATTRIBUTES[name].validated}
+    if changed is not None:
+        fields = {name: value for name, value in fields.items() if name in changed or name in ALWAYS}
     checks = (_checks if torch.compiler.is_compiling() else _cached_checks)(tuple(fields), config, max_opacity)
     before = None if previous is None else [getattr(previous, name) for name in fields]
     clamps = config.on_invalid == "clamp"
@@ -95,10 +93,8 @@ def validate_particles(
     clouds = {name: getattr(particles, name) for name in ("cloud_scene", "origin", "activity")}
     limits = {"grid_size": grid_size, "previous": before, "max_step": config.max_speed}
     limits["neutral"] = checks.neutral if in_kernel else None
-    values = list(fields.values())
-    validated = validate_state(
-        values, checks.bounds, particles.cu_rows, **clouds, **limits, join=not on_gpu, check=False
-    )
+    options = {**clouds, **limits, "join": not on_gpu, "check": False}
+    validated = validate_state(list(fields.values()), checks.bounds, particles.cu_rows, **options)
     if not torch.compiler.is_compiling():
         read = partial(_read, particles.clouds, where, checks, previous is not None)
         counts = _count_indices(*validated.record.shape, len(checks.kinds))
@@ -113,10 +109,9 @@ def validate_particles(
     replacements = before or [_neutral(name, particles) for name in fields]
     if not clamps:
         return _put_to_sleep(particles, fields, replacements, validated.status)
-    clamped = {
-        name: torch.where(value.isnan(), replacement, value).clamp(low, high)
-        for (name, value), replacement, (low, high) in zip(fields.items(), replacements, checks.bounds, strict=True)
-    }
+    given, clamped = zip(fields.items(), replacements, checks.bounds, strict=True), {}
+    for (name, value), replacement, (low, high) in given:
+        clamped[name] = torch.where(value.isnan(), replacement, value).clamp(low, high)
     means = _clamped_means(clamped["means"], particles, validated.status, config.max_speed, grid_size, previous)
     return dataclasses.replace(particles, **clamped | {"means": means})
 
@@ -215,11 +210,9 @@ def _check_choices(particles: Particles, where: str) -> None:
 
 def drop_particles(particles: Particles, dropped: Tensor) -> Particles:
     """Puts the particles in the mask ``dropped`` (bool [N]) to sleep and makes them invisible."""
-    return dataclasses.replace(
-        particles,
-        opacities=torch.where(dropped, 0.0, particles.opacities),
-        activity=torch.where(dropped, ASLEEP, particles.activity),
-    )
+    opacities = torch.where(dropped, 0.0, particles.opacities)
+    activity = torch.where(dropped, ASLEEP, particles.activity)
+    return dataclasses.replace(particles, opacities=opacities, activity=activity)
 
 
 def _read_images(frames: Frames, where: str, action: str, counts: Tensor) -> Reading:

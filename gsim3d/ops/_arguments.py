@@ -45,13 +45,8 @@ def check_floating(op: str, **first: Tensor) -> None:
 
 
 def check_numbers(op: str, *, largest_of: float = math.inf, **tensors: Tensor | None) -> None:
-    """Raises NumericalError, naming the argument and its row, where a number is not finite or too large.
-
-    None and tensors without numbers, or on a GPU, are passed over.
-
-    Args:
-        largest_of: bound of the size of these tensors' numbers, where it is below that of their dtype.
-    """
+    """Raises NumericalError, naming the argument and its row, where a number is not finite or too large: beyond what
+    its dtype allows, or ``largest_of``. None and tensors without numbers, or on a GPU, are passed over."""
     if torch.compiler.is_compiling():
         return
     for name, value in tensors.items():

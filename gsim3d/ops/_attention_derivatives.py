@@ -111,10 +111,7 @@ def gradients_of_gradients(grad, q, k, v, by_q, by_k, by_v, lists, scale: float)
     by_scores = weights * (by_weights - mean_by)
     of_weights = moved * (by_weights - mean_by) - mean_moved * by_weights + grad @ by_v.mT
     of_scores = weights * (of_weights - (weights * of_weights).sum(-1, keepdim=True))
-    results = (
-        patches.to_queries(moved_weights @ v + weights @ by_v),
-        patches.to_queries(scale * (of_scores @ k + by_scores @ by_k)),
-        patches.to_keys(scale * (of_scores.mT @ q + by_scores.mT @ by_q)),
-        patches.to_keys(moved_weights.mT @ grad),
-    )
+    of_queries = moved_weights @ v + weights @ by_v, scale * (of_scores @ k + by_scores @ by_k)
+    of_keys = scale * (of_scores.mT @ q + by_scores.mT @ by_q), moved_weights.mT @ grad
+    results = *map(patches.to_queries, of_queries), *map(patches.to_keys, of_keys)
     return tuple(x.to(dtype) for x in results)

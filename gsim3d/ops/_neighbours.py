@@ -105,19 +105,15 @@ def strided_pairs(
     """Output cells [M, 4], tap_in, tap_out, cu_taps: output o lies at input i where
     ``o stride + tap dilation - padding = i``. Voxels behind those of ``keys`` are the outputs."""
     device = keys.device
-    kernel_, stride_, padding_, dilation_ = (
-        torch.tensor(v, device=device) for v in (kernel, stride, padding, dilation)
-    )
+    each = (kernel, stride, padding, dilation)
+    kernel_, stride_, padding_, dilation_ = (torch.tensor(values, device=device) for values in each)
     taps, cells = _taps(kernel, device), _indices(keys)
     scaled = cells[None, :, 1:] + padding_ - (taps * dilation_)[:, None]
     outputs = torch.div(scaled, stride_, rounding_mode="floor")
     good = ((scaled >= 0) & (outputs * stride_ == scaled)).all(-1)
     if extent is not None:
-        size = torch.div(
-            torch.tensor(extent, device=device) + 2 * padding_ - dilation_ * (kernel_ - 1) - 1,
-            stride_,
-            rounding_mode="floor",
-        )
+        reach = torch.tensor(extent, device=device) + 2 * padding_ - dilation_ * (kernel_ - 1) - 1
+        size = torch.div(reach, stride_, rounding_mode="floor")
         good &= (outputs <= size).all(-1)
     tap, tap_in = good.nonzero().unbind(1)
     found = _keys(torch.cat([cells[tap_in, :1], outputs[tap, tap_in]], 1))

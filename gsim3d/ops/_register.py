@@ -140,13 +140,8 @@ def folded_segments(size: int, rows: Tensor, cu_rows: Tensor, n_rows: int) -> tu
 
 
 def register_autocast(op: str, rule: str | Callable[[str, Sequence[Any]], Sequence[Any]]) -> None:
-    """What gsim3d::``op`` computes in under ``torch.autocast``.
-
-    Args:
-        op: name.
-        rule: "float32": in float32; "follow": the same on the CPU, and in autocast's dtype on CUDA (float64 stays, as
-            in torch); or a function (device, arguments) -> arguments.
-    """
+    """What gsim3d::``op`` computes in under ``torch.autocast``: "float32"; "follow": the same on the CPU, and
+    autocast's dtype on CUDA (float64 stays, as in torch); or by a function (device, arguments) -> arguments."""
     overload = getattr(torch.ops.gsim3d, op).default
     for device in ("cpu", "cuda"):
         if rule == "float32" or (rule == "follow" and device == "cpu"):
@@ -177,13 +172,8 @@ def is_narrow(x: Any) -> bool:
 
 
 def refuse(op: str, tensors: dict[str, Tensor], *, forward_only: bool = False) -> None:
-    """Raises GradientError where one of ``tensors`` asks for a gradient that ``op`` does not have.
-
-    Args:
-        op: name, for the message.
-        tensors: by name.
-        forward_only: whether reverse mode has one.
-    """
+    """Raises GradientError where one of ``tensors``, by name, asks for a gradient that ``op`` does not have;
+    ``forward_only``: reverse mode has one."""
     is_forward = forward_ad._current_level >= 0
     if not is_forward and (forward_only or not torch.is_grad_enabled()):
         return

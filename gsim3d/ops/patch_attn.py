@@ -130,14 +130,12 @@ def _scale(q: Tensor, scale: float | None) -> float:
 
 
 # The same computation; what it returns there is not the whole gradient, so that it has none itself.
+_patch_backward = torch.ops.gsim3d.patch_attention_backward.default
+define(str(_patch_backward._schema).replace("gsim3d::patch", "joint", 1), _patch_backward)
+_tensors = "Tensor stats, Tensor q, Tensor k, Tensor q_rows, Tensor kv_rows, Tensor cu_q, Tensor cu_k"
 define(
-    str(torch.ops.gsim3d.patch_attention_backward.default._schema).replace("gsim3d::patch", "joint", 1),
-    torch.ops.gsim3d.patch_attention_backward.default,
-)
-define(
-    "attention_log_sum_exp(Tensor stats, Tensor q, Tensor k, Tensor q_rows, Tensor kv_rows, Tensor cu_q, Tensor cu_k, "
-    "float scale) -> Tensor",
-    lambda stats, q, k, q_rows, kv_rows, cu_q, cu_k, scale: stats[..., 1].log() + abs(scale) * stats[..., 0],
+    f"attention_log_sum_exp({_tensors}, float scale) -> Tensor",
+    lambda stats, *others: stats[..., 1].log() + abs(others[-1]) * stats[..., 0],
 )
 
 
@@ -249,10 +247,8 @@ def _joint_backward(ctx, grad, _grad_stats):
         return (None,) * 14
     q, *keys, out, stats = ctx.saved_tensors
     # Each table's part of the gradient follows from its own keys and the result over both.
-    own, other = (
-        torch.ops.gsim3d.joint_attention_backward(grad, q, *kv, out, stats, *lists, ctx.scale)
-        for kv, lists in ((keys[:2], keys[4:8]), (keys[2:4], keys[8:]))
-    )
+    tables, gradient = ((keys[:2], keys[4:8]), (keys[2:4], keys[8:])), torch.ops.gsim3d.joint_attention_backward
+    own, other = (gradient(grad, q, *kv, out, stats, *lists, ctx.scale) for kv, lists in tables)
     return own[0] + other[0], *own[1:], *other[1:], *(None,) * 9
 
 

@@ -203,10 +203,9 @@ def sh_to_color(directions: Tensor, sh: Tensor) -> Tensor:
     check_tensors("sh_to_color", directions=directions, sh=sh)
     check_floating("sh_to_color", directions=directions)
     if not 2 <= directions.dim() <= 4 or sh.dim() != (4 if directions.dim() == 4 else 3):
-        raise ValueError(
-            "sh_to_color: directions must be [N, 3] or [V, N, 3] with sh [N, K, D], or [B, V, N, 3] with sh "
-            f"[B, N, K, D]; got {list(directions.shape)} and {list(sh.shape)}"
-        )
+        wanted = "[N, 3] or [V, N, 3] with sh [N, K, D], or [B, V, N, 3] with sh [B, N, K, D]"
+        got = f"{list(directions.shape)} and {list(sh.shape)}"
+        raise ValueError(f"sh_to_color: directions must be {wanted}; got {got}")
     check_numbers("sh_to_color", largest_of=LARGEST, directions=directions, sh=sh)
     seen = directions[(None,) * (4 - directions.dim())]
     of_rows = sh[(None,) * (4 - sh.dim())].to(directions.dtype)
@@ -265,19 +264,14 @@ def _setup(ctx, inputs, output):
 def _backward(ctx, means2d, conics, depths, _, compensations):
     saved = ctx.saved_tensors
     means, n_pairs = saved[1], ctx.options[0]
-    sizes = ((2,), (3,), (), ())
-    pairs = [
-        means.new_zeros(n_pairs, *size) if grad is None else grad
-        for grad, size in zip((means2d, conics, depths, compensations), sizes)
-    ]
+    given = zip((means2d, conics, depths, compensations), ((2,), (3,), (), ()))
+    pairs = [means.new_zeros(n_pairs, *size) if grad is None else grad for grad, size in given]
     of_viewmats, of_Ks, of_distortion = ctx.needs_input_grad[5:8]
     options = *ctx.options, of_viewmats, of_Ks or of_distortion
     grads = torch.ops.gsim3d.project_gaussians_backward(*pairs, *saved, *options)
     wanted = (True, *(x is not None for x in saved[2:5]), of_viewmats, of_Ks, of_distortion)
-    means, quats, scales, covars, viewmats, Ks, distortion = (
-        grad if want else None for grad, want in zip(grads, wanted, strict=True)
-    )
-    return means, quats, scales, covars, None, viewmats, Ks, distortion, *[None] * 14
+    *of_rows, viewmats, Ks, distortion = (g if want else None for g, want in zip(grads, wanted, strict=True))
+    return *of_rows, None, viewmats, Ks, distortion, *[None] * 14
 
 
 def _sh_backward(ctx, grad):

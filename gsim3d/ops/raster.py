@@ -304,11 +304,8 @@ def empty_images(means: Tensor, n_images: int, width: int, height: int, n_featur
 
 def gradients_of_images(grads: Sequence[Tensor | None], transmittance: Tensor, n_features: int) -> list[Tensor]:
     """Gradients of color, alpha, depth and features; zeros where there is none."""
-    sizes = ((3,), (), (), (n_features,))
-    return [
-        transmittance.new_zeros(*transmittance.shape, *size) if grad is None else grad
-        for grad, size in zip(grads, sizes, strict=False)
-    ]
+    shape, given = transmittance.shape, zip(grads, ((3,), (), (), (n_features,)))
+    return [transmittance.new_zeros(*shape, *size) if grad is None else grad for grad, size in given]
 
 
 def _images(means, quats, scales, opacities, color, features, background, viewmats, *rest):

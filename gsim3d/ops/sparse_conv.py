@@ -224,14 +224,10 @@ def _beside(size, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps
     entry = torch.arange(size, device=tap_in.device)[:, None]
     tap = torch.searchsorted(cu_taps[1:], torch.arange(tap_in.shape[0], device=tap_in.device), right=True)
     order = torch.argsort(tap.expand(size, -1).flatten(), stable=True)
-    return (
-        (row_voxel + n_voxels * entry).flatten(),
-        (voxel_rows + n * entry).flatten(),
-        torch.cat([(cu_voxel_rows[:-1] + n * entry).flatten(), size * cu_voxel_rows[-1:]]),
-        (tap_in + n_voxels * entry).flatten()[order],
-        (tap_out + n_voxels * entry).flatten()[order],
-        size * cu_taps,
-    )
+    cu_voxel_rows = torch.cat([(cu_voxel_rows[:-1] + n * entry).flatten(), size * cu_voxel_rows[-1:]])
+    taps = ((tap + n_voxels * entry).flatten()[order] for tap in (tap_in, tap_out))
+    voxels = (row_voxel + n_voxels * entry).flatten(), (voxel_rows + n * entry).flatten(), cu_voxel_rows
+    return *voxels, *taps, size * cu_taps
 
 
 _of_input, _of_weight = "sparse_conv_grad_input", "sparse_conv_grad_weight"

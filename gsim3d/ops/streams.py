@@ -19,12 +19,9 @@ MANY_STREAMS = 8
 class Streams:
     """A context; what is run in it is done when the context is left, and may be read only then.
 
-    While a graph is captured, :meth:`run` makes nodes that wait for the work before them, not the other way round.
-    Else, and on the CPU, everything runs in order. The numbers are the same.
-
-    Args:
-        like: on the device of the work.
-        n_streams: at most ``MANY_STREAMS``, for long chains of small kernels.
+    While a graph is captured on the device of ``like``, :meth:`run` makes nodes that wait for the work before them, not
+    the other way round. Else, and on the CPU, everything runs in order. The numbers are the same. ``n_streams``: at
+    most ``MANY_STREAMS``, for long chains of small kernels.
     """
 
     def __init__(self, like: Tensor, n_streams: int = N_STREAMS):

@@ -20,10 +20,8 @@ SKIPPED = (
 )
 SKIPPED_IN_HEAD = "model.head.scratch.", "_aux."  # start of the name, and what it holds
 _DEPTH_ANYTHING = {
-    "model.backbone.pretrained.": "backbone.",
-    "model.head.": "depth_head.",
-    "model.cam_enc.": "camera_encoder.",
-}
+    "model.backbone.pretrained.": "backbone.", "model.head.": "depth_head.", "model.cam_enc.": "camera_encoder."
+}  # fmt: skip
 # Names of Hugging Face's Dinov2Model, as files and as version 5 of transformers have them.
 _HUGGING_FACE = [
     (r"^embeddings\.cls_token$", "cls_token"),
@@ -63,7 +61,8 @@ def load_depth_weights(encoder: Encoder, path: str | Path) -> list[str]:
         tensors = load_file(path)
     except (OSError, SafetensorError, ValueError) as error:
         raise InputError(f"{path}: not a readable .safetensors file: {str(error).splitlines()[0]}") from None
-    skipped = [name for name in tensors if _is_skipped(name)]
+    start, part = SKIPPED_IN_HEAD
+    skipped = [name for name in tensors if name.startswith(SKIPPED) or (name.startswith(start) and part in name)]
     model, own = encoder.config.vit.model, encoder.depth.state_dict()
     found = _own_names({name: value for name, value in tensors.items() if name not in skipped}, encoder, path)
     parts = set(_DEPTH_ANYTHING.values()) if any(name.startswith("model.") for name in tensors) else {"backbone."}
@@ -82,11 +81,6 @@ def load_depth_weights(encoder: Encoder, path: str | Path) -> list[str]:
         for name, (_, value) in found.items():
             own[name].copy_(value)
     return skipped
-
-
-def _is_skipped(name: str) -> bool:
-    start, part = SKIPPED_IN_HEAD
-    return name.startswith(SKIPPED) or (name.startswith(start) and part in name)
 
 
 def _own_names(tensors: dict[str, Tensor], encoder: Encoder, path: str | Path) -> _Named:

@@ -25,13 +25,8 @@ from gsim3d.state import ASLEEP, DYNAMIC, FROZEN, CloudTable, Particles
 
 
 def pixel_rows(frames: Frames, values: Tensor, shapes: StaticShapes | None = None) -> Tensor:
-    """Values of the pixels that become particles, in the order of these.
-
-    Args:
-        frames: what is encoded.
-        values: [I, H, W], of pixels.
-        shapes: as of :meth:`Encoder.forward`; values of padding are 0.
-    """
+    """Those of ``values`` [I, H, W] of the pixels that become particles, in the order of these. ``shapes``: as of
+    :meth:`Encoder.forward`; values of padding are 0."""
     if shapes is not None:
         index = PixelIndex.of(frames, shapes)
         return torch.where(index.exists, values.flatten()[index.pixel], 0)

@@ -60,8 +60,6 @@ class PixelIndex:
         count = masks.cumsum(1)
         number = torch.arange(1, size + 1, device=masks.device).repeat(n_clouds, 1)
         pixel = torch.searchsorted(count, number)
-        return cls(
-            (pixel.clamp(max=n_pixels - 1) + cloud * n_pixels).flatten(),
-            (pixel < n_pixels).flatten(),
-            torch.where(masks & (count <= size), count - 1 + cloud * size, n_clouds * size).flatten(),
-        )
+        particle = torch.where(masks & (count <= size), count - 1 + cloud * size, n_clouds * size)
+        exists, pixel = pixel < n_pixels, pixel.clamp(max=n_pixels - 1) + cloud * n_pixels
+        return cls(pixel.flatten(), exists.flatten(), particle.flatten())

@@ -41,14 +41,9 @@ class TimmBackbone(nn.Module):
 
 
 def relative_poses(viewmats: Tensor, n_views: int) -> tuple[Tensor, Tensor]:
-    """Poses that do not depend on where the world is, nor on how large.
-
-    Args:
-        viewmats: [I, 4, 4] world-to-camera; the V views of a scene follow each other.
-        n_views: V.
-    Returns:
-        [I, 4, 4] world-to-camera where the first view of a scene is the world, and [I] metres, by which translations
-        are divided: the lower median of the distances to the first view (its own 0 included), at least 0.1.
+    """Poses that do not depend on where the world is, nor on how large, of ``viewmats`` [I, 4, 4], V views of a scene
+    after each other: [I, 4, 4] world-to-camera where the first view of a scene is the world, and [I] metres, by which
+    translations are divided: the lower median of the distances to the first view (0 included), at least 0.1.
     """
     scenes = viewmats.unflatten(0, (-1, n_views))
     relative = scenes @ _inverse(scenes[:, :1])
