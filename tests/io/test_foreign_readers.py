@@ -13,7 +13,7 @@ import trimesh
 
 from gsim3d.errors import FitWarning, InputError
 from gsim3d.io import read_splats, write_splats
-from tests.io.test_formats import make, moving
+from tests.io.test_formats import assert_within_bounds, make, moving
 
 VALIDATE = """
 const validator = require("gltf-validator"), fs = require("fs");
@@ -38,6 +38,20 @@ def test_gsply_reads_the_same(suffix, degree, tmp_path):
     assert np.abs(theirs.sh0 - ours.sh[:, 0].numpy()).max() < 1e-2
     if degree:
         assert np.abs(np.array(theirs.shN).reshape(300, -1, 3) - ours.sh[:, 1:].numpy()).max() < 2e-2
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+@pytest.mark.parametrize("suffix, version", [(".ply", None), (".compressed.ply", None), (".spz", 3), (".spz", 4)])
+def test_what_gsply_writes_is_read(suffix, version, degree, tmp_path):
+    gsply = pytest.importorskip("gsply", reason="gsply is not installed")
+    given, file = make(300, degree), tmp_path / f"a{suffix}"
+    values = (given.means, given.scales.log(), given.quats, given.opacities.logit(), given.sh[:, 0], given.sh[:, 1:])
+    data = gsply.GSData(*(value.contiguous().numpy() for value in values))
+    if version:
+        gsply.write_spz(str(file), data, version=version)
+    else:
+        gsply.plywrite(str(file), data)
+    assert_within_bounds(suffix, read_splats(file, up="z"), given)
 
 
 def test_trimesh_reads_positions_of_glb_with_y_up(tmp_path):
