@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gsim3d.cameras import Cameras
 from gsim3d.errors import InputError, check_one_of
+from gsim3d.ops._arguments import check_tensors, check_whole
 from gsim3d.ops.projection import Projection, project_gaussians, sh_to_color
 from gsim3d.ops.raster import Rendering
 from gsim3d.ops.raster_projected import rasterize_projected
@@ -31,9 +32,8 @@ class Meta(dict):
 
     def __missing__(self, key: str) -> Any:
         if key in NO_TILES:
-            why = "lists of tiles are made inside of the kernel, in a form of its own"
-            advice = "read radii, means2d, conics and depths"
-            raise InputError(f"rasterization: meta[{key!r}] is not kept: {why}; {advice}")
+            advice = "the kernel makes tiles in a form of its own; read radii, means2d, conics and depths"
+            raise InputError(f"rasterization: meta[{key!r}] is not kept: {advice}")
         raise KeyError(key)
 
 
@@ -93,7 +93,7 @@ def rasterization(
         opacities: [..., N] in [0, 1].
         colors: [..., N, D] or [..., C, N, D]; with ``sh_degree`` [N, K, D] or [..., N, K, D] coefficients; also
             float16. None where ``render_mode`` has no colour.
-        viewmats: [..., C, 4, 4] world to camera.
+        viewmats: [..., C, 4, 4] world to camera; like ``Ks`` cast to the dtype of ``means``.
         Ks: [..., C, 3, 3] pixels.
         width, height: pixels.
         near_plane, far_plane: metres of camera z.
@@ -137,8 +137,11 @@ def rasterization(
     _refuse(offered, {"camera_model": (camera_model, LENSES), "render_mode": (render_mode, RENDER_MODES),
                       "rasterize_mode": (rasterize_mode, RASTERIZE_MODES)})  # fmt: skip
     with_color, with_depth = "RGB" in render_mode, "D" in render_mode.removeprefix("RGB")
+    optional = {"quats": quats, "scales": scales} if covars is None else {"covars": covars}
+    optional |= {"radial_coeffs": radial_coeffs, "tangential_coeffs": tangential_coeffs}
+    optional |= {"colors": colors, "backgrounds": backgrounds} if with_color else {}
+    _check(camera_model, means, viewmats, Ks, opacities, optional)
     batch, n, n_cameras = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
-    _check(batch, n, n_cameras, means, quats, scales, covars, opacities, viewmats, Ks)
     n_batches = math.prod(batch)
     n_images = n_batches * n_cameras
     antialiased = rasterize_mode == "antialiased"
@@ -152,16 +155,13 @@ def rasterization(
     options = {"lens": lens, "distortion": distortion, "jacobian": "clamped", "antialiased": antialiased, **limits}
     options["cu_rows"] = torch.arange(n_batches + 1, device=means.device) * n
     options["covars"] = None if covars is None else covars.reshape(-1, 3, 3)
-    flat_opacities = opacities.reshape(-1)
     projection = project_gaussians(
-        means.reshape(-1, 3), *shapes, cameras, opacities=flat_opacities, n_pairs=n_images * n, **options
+        means.reshape(-1, 3), *shapes, cameras, opacities=opacities.reshape(-1), n_pairs=n_images * n, **options
     )
-    values = means.new_zeros(n_images * n, 0)
-    if with_color:
-        values = _colors(colors, sh_degree, means, viewmats).flatten(0, -2)
+    values = _colors(colors, sh_degree, means, viewmats) if with_color else means.new_zeros(n_images * n, 0)
     of_images = opacities[..., None, :].expand(*batch, n_cameras, n).reshape(-1)
     alphas = of_images * projection.compensations if antialiased else of_images
-    rows = (*projection[:4], alphas, values)
+    rows = (*projection[:4], alphas, values.flatten(0, -2))
     meta, cu_pairs = Meta(batch_ids=None, camera_ids=None, gaussian_ids=None), projection.cu_pairs
     sizes = (*batch, n_cameras, n)
     if packed:
@@ -175,8 +175,7 @@ def rasterization(
     meta |= {"width": width, "height": height, "tile_size": 16 if tile_size is None else tile_size}
     meta |= {"n_batches": n_batches, "n_cameras": n_cameras}
     flat = [row.flatten(0, len(sizes) - 1) for row in (means2d, conics, depths, alphas, values)]
-    if backgrounds is not None:
-        backgrounds = backgrounds.reshape(n_images, -1) if with_color else None
+    backgrounds = backgrounds.flatten(0, -2) if with_color and backgrounds is not None else None
     absolute = _absolute(means2d) if absgrad and means2d.requires_grad else None
     image = rasterize_projected(
         *flat, width=width, height=height, cu_pairs=cu_pairs, background=backgrounds, absolute=absolute
@@ -193,14 +192,21 @@ def _refuse(offered: dict[str, Any], choices: dict[str, tuple[str, Sequence[str]
         check_one_of(f"rasterization: {name}", value, known)
 
 
-def _check(batch, n, n_cameras, means, quats, scales, covars, opacities, viewmats, Ks) -> None:
-    shapes = {"means": (means, (n, 3)), "opacities": (opacities, (n,))}
-    shapes |= {"viewmats": (viewmats, (n_cameras, 4, 4)), "Ks": (Ks, (n_cameras, 3, 3))}
-    if covars is None:
-        shapes |= {"quats": (quats, (n, 4)), "scales": (scales, (n, 3))}
-    else:
-        shapes["covars"] = (covars, (n, 3, 3))
-    for name, (value, shape) in shapes.items():
+def _check(camera_model: str, means, viewmats, Ks, opacities, optional: dict[str, Tensor | None]) -> None:
+    tensors = {"means": means, "viewmats": viewmats, "Ks": Ks, "opacities": opacities}
+    given = {name: value for name, value in optional.items() if value is not None}
+    check_tensors("rasterization", **tensors, **given)
+    if means.dim() < 2 or viewmats.dim() < 3 or any(value.dim() == 0 for value in given.values()):
+        raise ValueError("rasterization: means must be [..., N, 3], viewmats [..., C, 4, 4]: too few dimensions")
+    batch, n, n_cameras = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
+    shapes = {"means": (n, 3), "opacities": (n,), "viewmats": (n_cameras, 4, 4), "Ks": (n_cameras, 3, 3)}
+    shapes |= {"covars": (n, 3, 3)} if "covars" in optional else {"quats": (n, 4), "scales": (n, 3)}
+    n_radial = 4 if camera_model == "fisheye" or given.get("radial_coeffs", means).shape[-1] == 4 else 6
+    channels = given.get("colors", means).shape[-1]
+    of_cameras = {"backgrounds": channels, "radial_coeffs": n_radial, "tangential_coeffs": 2}
+    shapes |= {name: (n_cameras, size) for name, size in of_cameras.items() if name in given}
+    for name, shape in shapes.items():
+        value = (tensors | optional)[name]
         if value is None or value.shape != (*batch, *shape):
             got = None if value is None else list(value.shape)
             raise ValueError(f"rasterization: {name} must be {[*batch, *shape]}; got {got}")
@@ -210,18 +216,14 @@ def _lens(lens: str, radial: Tensor | None, tangential: Tensor | None, n_images:
     """The lens, and its coefficients in OpenCV's order."""
     if radial is None and tangential is None:
         return lens, None
-    if lens == "fisheye" and tangential is None:
-        return lens, radial.reshape(n_images, -1)
-    if lens != "pinhole":
+    if lens == "orthographic" or (lens == "fisheye" and tangential is not None):
         known = "radial_coeffs are of camera_model pinhole and fisheye, tangential_coeffs of pinhole"
         raise InputError(f"rasterization: {known}")
-    like = radial if tangential is None else tangential
-    zeros = like.new_zeros(n_images, 6)
-    k = zeros if radial is None else radial.reshape(n_images, -1)
-    p = zeros[:, :2] if tangential is None else tangential.reshape(n_images, -1)
-    if k.shape[1] not in (4, 6) or p.shape[1] != 2:
-        wanted = "radial_coeffs must be [..., C, 6] or [..., C, 4] and tangential_coeffs [..., C, 2]"
-        raise ValueError(f"rasterization: {wanted}; got {k.shape[1]} and {p.shape[1]} of each camera")
+    if lens == "fisheye":
+        return lens, radial.reshape(n_images, 4)
+    zeros = (radial if tangential is None else tangential).new_zeros(n_images, 6)
+    k = zeros if radial is None else radial.reshape(n_images, radial.shape[-1])
+    p = zeros[:, :2] if tangential is None else tangential.reshape(n_images, 2)
     return "opencv", torch.cat([k[:, :2], p, k[:, 2:], zeros[:, k.shape[1] :]], 1)
 
 
@@ -237,6 +239,7 @@ def _colors(colors: Tensor | None, sh_degree: int | None, means: Tensor, viewmat
             wanted = f"{[*batch, n, 'D']} or {[*batch, n_cameras, n, 'D']}"
             raise ValueError(f"rasterization: colors must be {wanted}; got {list(colors.shape)}")
         return colors
+    check_whole("rasterization", sh_degree=sh_degree)
     shared, n_terms = colors.dim() == 3, (sh_degree + 1) ** 2
     if colors.shape[:-2] not in ((n,), (*batch, n)) or not 0 <= sh_degree <= 4 or colors.shape[-2] < n_terms:
         wanted = f"with sh_degree={sh_degree} (0 to 4) colors must be [N={n}, K >= {n_terms}, D]"
@@ -245,11 +248,8 @@ def _colors(colors: Tensor | None, sh_degree: int | None, means: Tensor, viewmat
     turned, moved = viewmats[..., :3, :3], viewmats[..., :3, 3]
     centre = -(turned.mT @ moved[..., None])[..., 0]
     directions = means[..., None, :, :] - centre[..., None, :]
-    if shared:
-        seen = sh_to_color(directions.reshape(-1, n, 3), sh)
-    else:
-        seen = sh_to_color(directions.reshape(-1, n_cameras, n, 3), sh.reshape(-1, *sh.shape[-3:]))
-    return seen.reshape(*batch, n_cameras, n, -1)
+    rows = (directions.flatten(0, -3), sh) if shared else (directions.flatten(0, -4), sh.flatten(0, -4))
+    return sh_to_color(*rows).reshape(*directions.shape[:-1], sh.shape[-1])
 
 
 def _seen(rows: tuple[Tensor, ...], projection: Projection, n: int, n_cameras: int) -> tuple:

@@ -33,20 +33,37 @@ def check_tensors(op: str, **tensors: Any) -> None:
             raise TypeError(f"{op}: {name} is on {value.device}, but {first[0]} on {first[1]}")
 
 
-def check_floating(op: str, **first: Tensor) -> None:
-    """Raises ValueError, naming the argument whose dtype all others follow, unless it is float32 or float64.
+def check_floating(op: str, narrow: dict[str, Tensor | None] | None = None, **first: Tensor) -> None:
+    """Raises ValueError, naming the argument whose dtype all others follow, unless it is float32 or float64, or one of
+    ``narrow``, unless it has that dtype or 16 bits.
 
     On a GPU, where some ops take half precision, and under autocast, which casts, the op itself looks.
     """
     for name, value in first.items():
-        on_cpu = value.device.type == "cpu" and not torch.is_autocast_enabled("cpu")
-        if on_cpu and value.dtype not in (torch.float32, torch.float64):
-            raise ValueError(f"{op}: {name} must be float32 or float64; got {str(value.dtype).removeprefix('torch.')}")
+        device, dtype = value.device.type, str(value.dtype).removeprefix("torch.")
+        if device == "cpu" and dtype not in ("float32", "float64") and not torch.is_autocast_enabled("cpu"):
+            raise ValueError(f"{op}: {name} must be float32 or float64; got {dtype}")
+        for other, x in (narrow or {}).items():
+            allowed = x is None or x.dtype in (value.dtype, torch.float16, torch.bfloat16)
+            if not allowed and not torch.is_autocast_enabled(device):
+                raise ValueError(f"{op}: {other} must be {dtype}, as {name}, or of 16 bits; got {x.dtype}")
 
 
-def check_numbers(op: str, *, largest_of: float = math.inf, **tensors: Tensor | None) -> None:
+def check_ranges(op: str, n: int, **offsets: Tensor | None) -> None:
+    """Raises ValueError, naming the argument, unless offsets are int64 and, on the CPU, ascend from 0 to ``n``."""
+    for name, cu in offsets.items():
+        if cu is None:
+            continue
+        if cu.dim() != 1 or len(cu) == 0 or cu.dtype != torch.int64:
+            raise ValueError(f"{op}: {name} must be an int64 list of offsets; got {cu.dtype} {list(cu.shape)}")
+        readable = cu.device.type == "cpu" and not torch.compiler.is_compiling()
+        if readable and (cu[0] != 0 or cu[-1] != n or bool((cu.diff() < 0).any())):
+            raise ValueError(f"{op}: {name} must ascend from 0 to {n}; got {int(cu[0])} .. {int(cu[-1])}")
+
+
+def check_numbers(op: str, *, largest_of: float = math.inf, negative: bool = True, **tensors: Tensor | None) -> None:
     """Raises NumericalError, naming the argument and its row, where a number is not finite or too large: beyond what
-    its dtype allows, or ``largest_of``. None and tensors without numbers, or on a GPU, are passed over."""
+    its dtype allows, or ``largest_of``; or negative. None and tensors without numbers, or on a GPU, are passed over."""
     if torch.compiler.is_compiling():
         return
     for name, value in tensors.items():
@@ -55,9 +72,10 @@ def check_numbers(op: str, *, largest_of: float = math.inf, **tensors: Tensor | 
         while torch._C._functorch.is_functorch_wrapped_tensor(value):  # all entries of a batch are looked at
             value = torch._C._functorch.get_unwrapped(value)
         largest = min(LARGEST[value.dtype], largest_of)
+        least = -largest if negative else 0.0
         low, high = torch.aminmax(value.detach())
-        if not (low >= -largest and high <= largest):  # NaN is in neither range
-            _refuse(op, name, value.detach(), largest)
+        if not (low >= least and high <= largest):  # NaN is in neither range
+            _refuse(op, name, value.detach(), largest, least)
 
 
 def widened(x: Tensor) -> Tensor:
@@ -80,13 +98,12 @@ def widened_on_cpu(x: Tensor, *others: Tensor | None) -> tuple[Tensor | None, ..
     return tuple(t if t is None else widened(t) for t in tensors)
 
 
-def _refuse(op: str, name: str, value: Tensor, largest: float) -> None:
-    bad = ~(value.abs() <= largest)
+def _refuse(op: str, name: str, value: Tensor, largest: float, least: float) -> None:
+    bad = ~((value >= least) & (value <= largest))
     row = int(bad.reshape(len(value), -1).any(1).nonzero()[0]) if value.dim() else 0
     first = float(value[bad][0])
-    raise NumericalError(
-        f"{op}: {name} must be finite and at most {largest:g} in size; got {first:g} in row {row}", tensor=name, row=row
-    )
+    wanted = f"finite and at most {largest:g} in size" if least else f"finite, not negative and at most {largest:g}"
+    raise NumericalError(f"{op}: {name} must be {wanted}; got {first:g} in row {row}", tensor=name, row=row)
 
 
 def within_memory(op: str, what: str, kernel, *arguments):

@@ -71,10 +71,12 @@ def patch_attention(
 
 def _for_each_head(q: Tensor, k: Tensor, v: Tensor) -> list[Tensor]:
     """Keys and values with a head for each one of the queries."""
-    if any(x.dim() != 3 for x in (q, k, v)) or k.shape[1] in (0, q.shape[1]) or k.shape[1] != v.shape[1]:
+    if any(x.dim() != 3 for x in (q, k, v)) or k.shape[1] in (0, q.shape[1]):
         return [k, v]
     if q.shape[1] % k.shape[1]:
         raise ValueError(f"patch_attention: k must have H={q.shape[1]} heads or a divisor of it; got {k.shape[1]}")
+    if v.shape[1] != k.shape[1]:
+        raise ValueError(f"patch_attention: v must have as many heads as k, {k.shape[1]}; got {v.shape[1]}")
     return [x.repeat_interleave(q.shape[1] // k.shape[1], 1) for x in (k, v)]
 
 

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.errors import NumericalError
-from gsim3d.ops._arguments import check_floating, check_numbers, check_tensors
+from gsim3d.ops._arguments import check_floating, check_numbers, check_ranges, check_tensors
 from gsim3d.ops._register import fakes, register_autocast, register_gradients, save_inputs
 
 
@@ -81,8 +81,7 @@ def _check_geometry(Ks: Tensor, viewmats: Tensor, src_images: Tensor, cu_src: Te
     check_numbers(op, **matrices)
     if n_pairs and not (int(src_images.min()) >= 0 and int(src_images.max()) < n):
         raise ValueError(f"{op}: src_images must be in [0, {n})")
-    if int(cu_src[0]) != 0 or int(cu_src[-1]) != n_pairs or bool((cu_src.diff() < 0).any()):
-        raise ValueError(f"{op}: cu_src must ascend from 0 to {n_pairs}")
+    check_ranges(op, n_pairs, cu_src=cu_src)
 
 
 def plane_sweep(

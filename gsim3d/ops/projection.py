@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsim3d.cameras import Cameras
 from gsim3d.errors import check_one_of
-from gsim3d.ops._arguments import check_floating, check_numbers, check_real, check_tensors, check_whole, within_memory
+from gsim3d.ops._arguments import check_floating, check_numbers, check_ranges, check_real, check_tensors, within_memory
 from gsim3d.ops._register import fakes, register_autocast, register_gradients, save_inputs
 from gsim3d.ops.raster import LARGEST, check_scene
 
@@ -94,7 +94,8 @@ def project_gaussians(
     Determinism:
         equal bits for any number of threads; on a GPU from run to run, and nothing waits for the device.
     Raises:
-        NumericalError: a number is not finite or beyond 1e15; CPU only. On a GPU such a row is not seen.
+        NumericalError: a number is not finite or beyond 1e15, or a scale negative; CPU only. On a GPU such a row is not
+            seen.
         ValueError, TypeError: an argument is malformed; the message names it.
     Source:
         Zwicker et al. 2002 (EWA splatting), Yu et al. 2024 (Mip-Splatting), OpenCV's camera models; conventions of
@@ -112,7 +113,7 @@ def project_gaussians(
     """
     given = {"quats": quats, "scales": scales, "covars": covars, "opacities": opacities, "distortion": distortion}
     tensors = {"means": means} | {name: value for name, value in given.items() if value is not None}
-    _check(tensors, cameras, cu_rows, lens, jacobian)
+    _check(tensors, cameras, cu_rows, {} if n_pairs is None else {"n_pairs": n_pairs}, lens, jacobian)
     check_real(OP, near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, dilation=dilation)
     n, n_images = means.shape[0], cameras.viewmats.shape[0]
     if cu_rows is None:
@@ -124,7 +125,6 @@ def project_gaussians(
         if means.device.type != "cpu":
             raise ValueError(f"{OP}: n_pairs is needed beside cu_rows on a GPU, where counting would wait for it")
         n_pairs = int(cu_pairs[-1])
-    check_whole(OP, n_pairs=n_pairs)
     limits = None
     if distortion is not None:
         limits = lens_limits(lens, distortion).to(means.dtype)
@@ -136,8 +136,7 @@ def project_gaussians(
         *(near_plane, far_plane, radius_clip, dilation, LENSES[lens], jacobian == "clamped", antialiased),
     )
     made = within_memory(OP, f"n_pairs={n_pairs}", torch.ops.gsim3d.project_gaussians, *args)
-    means2d, conics, depths, radii, compensations = made
-    return Projection(means2d, conics, depths, radii, compensations, cu_pairs)
+    return Projection(*made, cu_pairs)
 
 
 def lens_limits(lens: str, distortion: Tensor) -> Tensor:
@@ -201,30 +200,26 @@ def sh_to_color(directions: Tensor, sh: Tensor) -> Tensor:
         tensor([[0.7820, 0.7820, 0.7820]])
     """
     check_tensors("sh_to_color", directions=directions, sh=sh)
-    check_floating("sh_to_color", directions=directions)
+    check_floating("sh_to_color", {"sh": sh}, directions=directions)
     if not 2 <= directions.dim() <= 4 or sh.dim() != (4 if directions.dim() == 4 else 3):
         wanted = "[N, 3] or [V, N, 3] with sh [N, K, D], or [B, V, N, 3] with sh [B, N, K, D]"
-        got = f"{list(directions.shape)} and {list(sh.shape)}"
-        raise ValueError(f"sh_to_color: directions must be {wanted}; got {got}")
+        raise ValueError(f"sh_to_color: directions must be {wanted}; got {list(directions.shape)} and {list(sh.shape)}")
     check_numbers("sh_to_color", largest_of=LARGEST, directions=directions, sh=sh)
     seen = directions[(None,) * (4 - directions.dim())]
     of_rows = sh[(None,) * (4 - sh.dim())].to(directions.dtype)
     return torch.ops.gsim3d.sh_to_color(seen, of_rows).reshape(*directions.shape[:-1], sh.shape[-1])
 
 
-def _check(tensors: dict, cameras: Cameras, cu_rows: Tensor | None, lens: str, jacobian: str) -> None:
-    check_scene(OP, tensors | ({} if cu_rows is None else {"cu_rows": cu_rows}), cameras)
+def _check(tensors: dict, cameras: Cameras, cu_rows: Tensor | None, sizes: dict, lens: str, jacobian: str) -> None:
+    check_scene(OP, tensors | ({} if cu_rows is None else {"cu_rows": cu_rows}), cameras, **sizes)
     if ("covars" in tensors) == ("quats" in tensors or "scales" in tensors):
         raise ValueError(f"{OP}: give quats and scales, or covars")
     check_one_of(f"{OP}: lens", lens, LENSES)
     check_one_of(f"{OP}: jacobian", jacobian, JACOBIANS)
-    for name, indices in (("cameras.image_cloud", cameras.image_cloud), ("cu_rows", cu_rows)):
-        if indices is not None and (indices.dtype != torch.int64 or indices.dim() != 1):
-            raise ValueError(f"{OP}: {name} must be int64 and a list; got {indices.dtype} {list(indices.shape)}")
-    if cu_rows is not None and cu_rows.device.type == "cpu" and not torch.compiler.is_compiling():
-        n, ends = len(tensors["means"]), cu_rows[[0, -1]].tolist() if len(cu_rows) else []
-        if ends != [0, n] or bool((cu_rows.diff() < 0).any()):
-            raise ValueError(f"{OP}: cu_rows must ascend from 0 to N={n}; got {' .. '.join(map(str, ends)) or 'none'}")
+    clouds = cameras.image_cloud
+    if clouds.dtype != torch.int64 or clouds.dim() != 1:
+        raise ValueError(f"{OP}: cameras.image_cloud must be int64 [I]; got {clouds.dtype} {list(clouds.shape)}")
+    check_ranges(OP, len(tensors["means"]), cu_rows=cu_rows)
     distortion, n_images = tensors.get("distortion"), len(cameras)
     if distortion is not None:
         sizes = N_DISTORTION.get(lens, ())
@@ -234,6 +229,7 @@ def _check(tensors: dict, cameras: Cameras, cu_rows: Tensor | None, lens: str, j
             wanted = " or ".join(str(size) for size in sizes)
             raise ValueError(f"{OP}: distortion must be [I={n_images}, {wanted}]; got {list(distortion.shape)}")
     check_numbers(OP, largest_of=LARGEST, **tensors)
+    check_numbers(OP, negative=False, scales=tensors.get("scales"))
 
 
 def _pairs(means, *rest):
@@ -270,8 +266,8 @@ def _backward(ctx, means2d, conics, depths, _, compensations):
     options = *ctx.options, of_viewmats, of_Ks or of_distortion
     grads = torch.ops.gsim3d.project_gaussians_backward(*pairs, *saved, *options)
     wanted = (True, *(x is not None for x in saved[2:5]), of_viewmats, of_Ks, of_distortion)
-    *of_rows, viewmats, Ks, distortion = (g if want else None for g, want in zip(grads, wanted, strict=True))
-    return *of_rows, None, viewmats, Ks, distortion, *[None] * 14
+    grads = [grad if want else None for grad, want in zip(grads, wanted, strict=True)]
+    return *grads[:4], None, *grads[4:], *[None] * 14  # none of opacities
 
 
 def _sh_backward(ctx, grad):
@@ -284,8 +280,7 @@ fakes(
     sh_to_color=lambda directions, sh: directions.new_empty(*directions.shape[:3], sh.shape[3]),
     sh_to_color_backward=lambda grad, *inputs: tuple(x.new_empty(x.shape) for x in inputs),
 )
-_gradient_ops = ["project_gaussians_backward"]
-register_gradients(OP, _backward, _setup, gradient_ops=_gradient_ops, without=["opacities", "limits"])
+register_gradients(OP, _backward, _setup, gradient_ops=[f"{OP}_backward"], without=["opacities", "limits"])
 register_gradients("sh_to_color", _sh_backward, save_inputs, gradient_ops=["sh_to_color_backward"])
 for _op in (OP, "sh_to_color"):
     register_autocast(_op, "float32")

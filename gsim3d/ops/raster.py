@@ -224,14 +224,14 @@ def _check_arguments(
         raise ValueError(f"{OP}: active must be bool [I, H, W] = {list(size)}; got {active.dtype} {list(active.shape)}")
 
 
-def check_scene(op: str, tensors: dict[str, Tensor], cameras: Cameras) -> None:
-    """Types of ``tensors`` and ``cameras``, and numbers of dimensions that are read before a kernel checks them."""
+def check_scene(op: str, tensors: dict[str, Tensor], cameras: Cameras, **sizes: int) -> None:
+    """Types of all arguments, and numbers of dimensions that are read before a kernel checks them."""
     if not isinstance(cameras, Cameras):
         raise TypeError(f"{op}: cameras must be gsim3d.Cameras; got {type(cameras).__name__}")
     of_cameras = {f"cameras.{name}": getattr(cameras, name) for name in ("viewmats", "Ks", "image_cloud")}
     check_tensors(op, **tensors, **of_cameras)
     check_floating(op, means=tensors["means"])
-    check_whole(op, **{f"cameras.{name}": getattr(cameras, name) for name in ("width", "height")})
+    check_whole(op, **sizes, **{f"cameras.{name}": getattr(cameras, name) for name in ("width", "height")})
     shapes = {"means": "[N, 3]", "cameras.viewmats": "[I, 4, 4]", "cameras.Ks": "[I, 3, 3]", "cu_rows": "[Q + 1]"}
     for name, shape in shapes.items():
         value = (tensors | of_cameras).get(name)
@@ -302,7 +302,7 @@ def empty_images(means: Tensor, n_images: int, width: int, height: int, n_featur
     return [*floats, means.new_empty(shape, dtype=torch.int32), means.new_empty(n_bytes, dtype=torch.uint8)]
 
 
-def gradients_of_images(grads: Sequence[Tensor | None], transmittance: Tensor, n_features: int) -> list[Tensor]:
+def grads_of_images(grads: Sequence[Tensor | None], transmittance: Tensor, n_features: int) -> list[Tensor]:
     """Gradients of color, alpha, depth and features; zeros where there is none."""
     shape, given = transmittance.shape, zip(grads, ((3,), (), (), (n_features,)))
     return [transmittance.new_zeros(*shape, *size) if grad is None else grad for grad, size in given]
@@ -338,7 +338,7 @@ def _setup(ctx, inputs, output):
 
 def _backward(ctx, *grads):
     saved = ctx.saved_tensors  # read once: a checkpoint gives them once
-    images = gradients_of_images(grads, saved[0], saved[8].shape[1])
+    images = grads_of_images(grads, saved[0], saved[8].shape[1])
     viewmats_grad = ctx.needs_input_grad[7]
     *grads, viewmats = call(f"{OP}_backward", *images, *saved[:14], *ctx.options, viewmats_grad, *saved[14:])
     return (*grads, viewmats if viewmats_grad else None, *[None] * 13)

@@ -7,17 +7,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsim3d.errors import check_one_of
-from gsim3d.ops._arguments import check_floating, check_numbers, check_tensors, check_whole, within_memory
+from gsim3d.ops._arguments import check_floating, check_numbers, check_ranges, check_tensors, check_whole, within_memory
 from gsim3d.ops._register import fakes, register_autocast, register_gradients
-from gsim3d.ops.raster import (
-    CUTOFFS,
-    LARGEST,
-    Rendering,
-    empty_images,
-    gradients_of_images,
-    sizes_of_state,
-    state_bytes,
-)
+from gsim3d.ops.raster import CUTOFFS, LARGEST, Rendering, empty_images, grads_of_images, sizes_of_state, state_bytes
 
 OP = "rasterize_projected"
 
@@ -96,8 +88,10 @@ def rasterize_projected(
 
 def _check(rows: dict[str, Tensor], optional: dict[str, Tensor], width: int, height: int, cutoff: str) -> None:
     check_tensors(OP, **rows, **optional)
-    check_floating(OP, means2d=rows["means2d"])
+    check_floating(OP, {"colors": rows["colors"], "background": optional.get("background")}, means2d=rows["means2d"])
     check_whole(OP, width=width, height=height)
+    if not (0 < width < 2**16 and 0 < height < 2**16):
+        raise ValueError(f"{OP}: width and height must be in [1, 65535]; got {width} and {height}")
     check_one_of(f"{OP}: cutoff", cutoff, ("exact", "smooth"))
     n = rows["means2d"].shape[0] if rows["means2d"].dim() else 0
     shapes = {"means2d": (n, 2), "conics": (n, 3), "depths": (n,), "opacities": (n,), "absolute": (n, 2)}
@@ -107,16 +101,11 @@ def _check(rows: dict[str, Tensor], optional: dict[str, Tensor], width: int, hei
     colors, cu_pairs, background = rows["colors"], optional.get("cu_pairs"), optional.get("background")
     if colors.dim() != 2 or colors.shape[0] != n or not colors.is_floating_point():
         raise ValueError(f"{OP}: colors must be [P={n}, D] of floats; got {colors.dtype} {list(colors.shape)}")
-    if cu_pairs is not None and (cu_pairs.dim() != 1 or cu_pairs.shape[0] < 1 or cu_pairs.dtype != torch.int64):
-        raise ValueError(f"{OP}: cu_pairs must be int64 [I + 1]; got {cu_pairs.dtype} {list(cu_pairs.shape)}")
-    readable = cu_pairs is not None and cu_pairs.device.type == "cpu" and not torch.compiler.is_compiling()
-    if readable and (cu_pairs[0] != 0 or cu_pairs[-1] != n or bool((cu_pairs.diff() < 0).any())):
-        raise ValueError(f"{OP}: cu_pairs must run from 0 to P={n} without descending; got {cu_pairs.tolist()}")
-    n_images = 1 if cu_pairs is None else cu_pairs.shape[0] - 1
-    if background is not None and background.shape not in ((colors.shape[1],), (n_images, colors.shape[1])):
-        wanted = f"[D={colors.shape[1]}] or [I={n_images}, D]"
-        raise ValueError(f"{OP}: background must be {wanted}; got {list(background.shape)}")
-    check_numbers(OP, largest_of=LARGEST, **rows)
+    check_ranges(OP, n, cu_pairs=cu_pairs)
+    n_images, d = 1 if cu_pairs is None else cu_pairs.shape[0] - 1, colors.shape[1]
+    if background is not None and background.shape not in ((d,), (n_images, d)):
+        raise ValueError(f"{OP}: background must be [D={d}] or [I={n_images}, D]; got {list(background.shape)}")
+    check_numbers(OP, largest_of=LARGEST, **rows, background=background)
 
 
 def _images(means2d, conics, depths, opacities, color, features, background, absolute, image_cloud, cu_rows, *rest):
@@ -146,7 +135,7 @@ def _setup(ctx, inputs, output):
 def _backward(ctx, *grads):
     saved, with_absolute = ctx.saved_tensors, ctx.needs_input_grad[7]
     n_features = saved[8].shape[1]
-    images = gradients_of_images(grads, saved[0], n_features)
+    images = grads_of_images(grads, saved[0], n_features)
     found = torch.ops.gsim3d.rasterize_projected_backward(*images, *saved, *ctx.options, with_absolute)
     *rows, features, background = found
     absolute = features[:, n_features:] if with_absolute else None

@@ -139,6 +139,24 @@ def test_antialiased_covars_and_cameras(device, camera_model, with_covars, eps2d
     assert (meta["opacities"].cpu() <= arguments["opacities"] + 1e-12).all()
 
 
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize(("batch", "cameras", "n"), [((), 2, 0), ((), 0, 5), ((0,), 2, 5), ((2,), 0, 5), ((2,), 1, 0)])
+def test_nothing_to_draw(device, batch, cameras, n, packed):
+    arguments = {name: x.to(device) for name, x in scene_of((), cameras=2, n=5).items()}
+    of_cameras = {name: arguments[name][:cameras].expand(*batch, -1, -1, -1) for name in ("viewmats", "Ks")}
+    of_rows = {name: x[:n].expand(*batch, n, *x.shape[1:]) for name, x in arguments.items() if name not in of_cameras}
+    backgrounds = torch.rand(*batch, cameras, 3, dtype=torch.float64, device=device)
+    sh = torch.rand(*batch, n, 9, 3, dtype=torch.float64, device=device)
+    for options in ({}, {"colors": sh, "sh_degree": 2}, {"colors": sh[(0,) * len(batch)] if 0 not in batch else sh}):
+        if options.keys() == {"colors"}:
+            options["sh_degree"], options["colors"] = 1, options["colors"][..., :4, :]
+        call = of_rows | of_cameras | options
+        color, alpha, _ = rasterization(**call, **SIZE, backgrounds=backgrounds, packed=packed)
+        assert color.shape == (*batch, cameras, 37, 45, 3) and alpha.shape == (*batch, cameras, 37, 45, 1)
+        if n == 0:
+            assert_same_bits(color, backgrounds[..., None, None, :].expand(color.shape))
+
+
 @pytest.mark.parametrize("sh_degree", range(5))
 @pytest.mark.parametrize("batch", [(), (2,)])
 def test_harmonics(device, batch, sh_degree):
@@ -255,6 +273,20 @@ def test_wrong_shapes_are_named():
             )
     with pytest.raises(ValueError, match="colors"):
         rasterization(**arguments | {"colors": None}, **SIZE)
+    wrong = {
+        "backgrounds": torch.zeros(3), "radial_coeffs": torch.zeros(8), "tangential_coeffs": torch.zeros(1, 4),
+        "viewmats": torch.eye(4), "colors": torch.zeros(40, 3),
+    }  # fmt: skip
+    for name, value in wrong.items():
+        value = value if name == "colors" else value.double()
+        with pytest.raises(ValueError, match=name):
+            rasterization(**arguments | {name: value}, **SIZE)
+    with pytest.raises(ValueError, match=r"radial_coeffs must be \[2, 4\]"):
+        rasterization(**arguments, **SIZE, camera_model="fisheye", radial_coeffs=torch.zeros(2, 6).double())
+    with pytest.raises(TypeError, match="means must be a tensor"):
+        rasterization(**arguments | {"means": [0.0]}, **SIZE)
+    with pytest.raises(TypeError, match="sh_degree must be a whole number"):
+        rasterization(**arguments | {"colors": torch.zeros(40, 4, 3).double()}, **SIZE, sh_degree=1.0)
     with pytest.raises(ValueError, match="sh_degree=5"):
         rasterization(**arguments | {"colors": torch.zeros(40, 36, 3).double()}, **SIZE, sh_degree=5)
 

@@ -37,6 +37,8 @@ def test_grouped_heads_read_shared_keys():
     assert gradcheck(attend, [x.requires_grad_() for x in (q, k, v)])
     with pytest.raises(ValueError, match="k must have H=3 heads or a divisor"):
         attend(heads(6, 3), k, v)
+    with pytest.raises(ValueError, match="v must have as many heads as k, 2; got 1"):
+        attend(q, k, v[:, :1])
 
 
 def test_32_bit_lists(device):

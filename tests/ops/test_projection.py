@@ -438,6 +438,12 @@ def test_errors_name_the_argument():
         call(cameras=dataclasses.replace(cameras, image_cloud=torch.tensor([0, 1, 2])))
     with pytest.raises(NumericalError, match="means must be finite"):
         call(means=torch.full_like(means, math.nan))
+    with pytest.raises(NumericalError, match="scales must be finite, not negative and at most"):
+        project_gaussians(means, quats, -scales - 1, cameras, cu_rows=case.cu_rows)
+    with pytest.raises(ValueError, match="cu_rows must ascend from 0"):
+        call(cu_rows=case.cu_rows.flip(0))
+    with pytest.raises(ValueError, match="sh must be float32, as directions, or of 16 bits; got torch.float64"):
+        sh_to_color(torch.zeros(2, 3), torch.zeros(2, 4, 3).double())
     with pytest.raises(ValueError, match="float32 or float64"):
         call(means=means.half())
     with pytest.raises(ValueError, match=r"1, 4, 9, 16 or 25 coefficients"):

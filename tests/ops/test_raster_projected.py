@@ -260,10 +260,21 @@ def test_errors_name_the_argument():
         rasterize_projected(*first, colors, cutoff="tile3sigma", **size)
     with pytest.raises(ValueError, match="width and height"):
         rasterize_projected(*first, colors, width=0, height=4, cu_pairs=cu_pairs)
-    with pytest.raises(ValueError, match="cu_pairs must run from 0"):
+    with pytest.raises(ValueError, match="cu_pairs must ascend from 0 to 60"):
         rasterize_projected(*first, colors, width=4, height=4, cu_pairs=torch.tensor([0, 10]))
     with pytest.raises(NumericalError, match="means2d must be finite"):
         rasterize_projected(first[0] / 0, *first[1:], colors, **size)
+    with pytest.raises(NumericalError, match="rasterize_projected: background must be finite"):
+        rasterize_projected(*first, colors, background=background / 0, **size)
+
+
+def test_dtypes_are_not_changed_silently():
+    (*first, colors, background), cu_pairs = random_rows(dtype=torch.float32)
+    size = {"width": WIDTH, "height": HEIGHT, "cu_pairs": cu_pairs}
+    with pytest.raises(ValueError, match="colors must be float32, as means2d, or of 16 bits; got torch.float64"):
+        rasterize_projected(*first, colors.double(), **size)
+    with pytest.raises(ValueError, match="background must be float32"):
+        rasterize_projected(*first, colors, background=background.int(), **size)
 
 
 def test_second_derivatives_are_refused_by_name():
