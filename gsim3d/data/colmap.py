@@ -23,7 +23,7 @@ from gsim3d.errors import InputError
 NAME = "colmap"
 FILE = "sparse/0"
 FOLDERS = (FILE, "sparse", "colmap/sparse/0", ".")
-SETTINGS = "scene.json"
+SETTINGS, KEYS = "scene.json", ("fps", "near", "far", "origin", "bounds")
 MODELS = (  # indexed by COLMAP's model id
     ("SIMPLE_PINHOLE", "f cx cy"), ("PINHOLE", "fl_x fl_y cx cy"), ("SIMPLE_RADIAL", "f cx cy k1"),
     ("RADIAL", "f cx cy k1 k2"), ("OPENCV", "fl_x fl_y cx cy k1 k2 p1 p2"),
@@ -48,6 +48,8 @@ def read(folder: Path, problems: Problems) -> Recording:
     """Reads the scene in ``folder``. Raises InputError if its description cannot be parsed."""
     model = _model_of(folder)
     settings = read_json(folder / SETTINGS) if (folder / SETTINGS).is_file() else {}
+    if other := next((key for key in settings if key not in KEYS), None):
+        raise InputError(f"{folder / SETTINGS}: {other:.80} is no key of this file; it has {', '.join(KEYS)}")
     fps = Description(settings, f"{folder / SETTINGS}: ", problems).positive("fps")
     source = _file(model, "images")
     cameras = dict(_bounded(_cameras(_file(model, "cameras")), model))
@@ -208,7 +210,7 @@ def _lines(file: Path, pairs: bool = False) -> Iterator[tuple[str, str]]:
             number += 1
             what = f"{file}: line {number}"
             try:
-                line = raw.decode().strip()
+                line = raw.decode("utf-8-sig").strip()
             except UnicodeDecodeError:
                 raise InputError(f"{what} cannot be read: it is not UTF-8") from None
             if len(raw) == MAX_LINE:

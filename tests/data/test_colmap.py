@@ -246,3 +246,22 @@ def test_colmap_missing_image_is_named(tmp_path):
     assert any("4x4 pixels" in line for line in check_scene(folder).problems)
     (folder / "images").rename(folder / "elsewhere")
     assert any("images/view 10.png" in line and "missing" in line for line in check_scene(folder).problems)
+
+
+def test_colmap_text_of_windows(tmp_path):
+    made = make_scene(n_steps=1, n_cams=4)
+    write_colmap(tmp_path, made, binary=False, names=lambda step, cam: f"left/{cam}.png", points=seen_points())
+    expected = Scene.open(tmp_path)
+    for file in (tmp_path / "sparse/0").glob("*.txt"):
+        file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes().replace(b"\n", b"\r\n").replace(b"left/", b"left\\"))
+    scene = Scene.open(tmp_path)
+    np.testing.assert_array_equal(scene.recording.viewmats, expected.recording.viewmats)
+    assert (scene.images(range(4), [0]) == expected.images(range(4), [0])).all() and scene.near == expected.near
+
+
+@pytest.mark.parametrize("key", ["units", "fsp", "k1", "camera_model"])
+def test_colmap_other_settings_are_refused(tmp_path, key):
+    write_colmap(tmp_path, make_scene(n_steps=1, n_cams=4))
+    (tmp_path / "scene.json").write_text(json.dumps({"near": 1.0, key: 1}))
+    with pytest.raises(InputError, match=f"scene.json: {key} is no key of this file; it has fps, near, far"):
+        Scene.open(tmp_path)
