@@ -19,7 +19,7 @@ MAX_STEPS, MAX_CAMS, MAX_SIZE = 1_000_000, 10_000, 16_384  # larger values are r
 MAX_NUMBER = 1e9  # metres, pixels, seconds; larger values are rejected as errors
 MAX_NAME = 200  # characters of a file name
 HALF_PAIR = re.compile(r"\\u[dD][89a-fA-F]")  # JSON escape of a surrogate, possibly unpaired
-SPACING_TOLERANCE = 0.01  # relative, of the time between two steps
+SPACING_TOLERANCE, MAX_ROUNDING = 0.05, 0.25  # largest deviation from even spacing in steps, of rounded times
 BACKGROUND, FIXED, MOVING = 0, 1, 3  # pixel labels: background, static geometry, movable bodies
 
 # (camera, ascending steps, problems) -> one image per step; None on error
@@ -196,7 +196,9 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def array(value: Any, shapes: Sequence[tuple[int, ...]], what: str, problems: Problems) -> np.ndarray | None:
+def array(
+    value: Any, shapes: Sequence[tuple[int, ...]], what: str, problems: Problems, most: float = MAX_NUMBER
+) -> np.ndarray | None:
     """Converts ``value`` to a finite float64 array of one of ``shapes``; reports errors of ``what``, returns None."""
     if value is None:
         problems.add(f"{what} is missing")
@@ -217,8 +219,8 @@ def array(value: Any, shapes: Sequence[tuple[int, ...]], what: str, problems: Pr
         null = given.dtype.kind == "O" and given[tuple(index)] is None
         problems.add(f"{what}{frame} contains {'null' if null else 'values that are not finite'}")
         return None
-    if (np.abs(numbers) > MAX_NUMBER).any():
-        problems.add(f"{what} contains {np.abs(numbers).max():g}; magnitudes above {MAX_NUMBER:g} are not allowed")
+    if (np.abs(numbers) > most).any():
+        problems.add(f"{what} contains {np.abs(numbers).max():g}; magnitudes above {most:g} are not allowed")
         return None
     return numbers
 
@@ -302,6 +304,11 @@ def common_numbers(numbers: dict[str, Sequence[int]], source: Path, problems: Pr
 def step_rate(times: np.ndarray) -> tuple[float, int | None]:
     """Returns the rate (1/s) of ascending ``times``, and the index of the first uneven step (None if even)."""
     gaps = np.diff(times)
+    rate = len(gaps) / (times[-1] - times[0])
+    late = np.abs((times - times[0]) * rate - np.arange(len(times)))  # in steps
+    # Times may be rounded, at 60 fps to 0.017, 0.033, 0.05.
+    digits = (unit for unit in (1, 0.1, 0.01, 1e-3) if np.abs(times / unit - np.round(times / unit)).max() < 1e-6)
+    if late.max() <= max(SPACING_TOLERANCE, min(1.01 * rate * next(digits, 0), MAX_ROUNDING)):
+        return float(rate), None
     usual = float(np.median(gaps))
-    broken = np.abs(gaps - usual) > SPACING_TOLERANCE * usual
-    return 1 / usual, int(np.argmax(broken)) if broken.any() else None
+    return 1 / usual, int(np.argmax(np.abs(gaps - usual)))

@@ -24,6 +24,7 @@ SPLITS = ("transforms_train.json", "transforms_val.json", "transforms_test.json"
 ANGLES = ("camera_angle_x", "camera_angle_y")
 OWN = ("frames", "file_path", "transform_matrix", "time", "camera", "mask_path", "label_path")  # never defaults
 SAME_FOCAL = 0.02  # relative difference between focal lengths given as such and as angles
+MAX_TIME = 1e19  # nanoseconds since 1970 are below
 SAME_TIME = 1e-6  # fraction of the duration; closer times belong to one step
 
 
@@ -135,7 +136,9 @@ def _table(frames: list[dict], source: Path, problems: Problems) -> tuple[dict, 
         raise InputError(
             f"{source}: frames[{timeless[0]}] ({frames[timeless[0]]['file_path']}) has no time, but other frames have"
         )
-    stamps = array([frame["time"] for frame in frames], [(len(frames),)], f"{source}: time of frames", problems)
+    stamps = array(
+        [frame["time"] for frame in frames], [(len(frames),)], f"{source}: time of frames", problems, MAX_TIME
+    )
     if stamps is None:
         raise InputError(f"{source}: every frame needs a finite time")
     order = np.argsort(stamps, kind="stable")

@@ -107,6 +107,37 @@ def test_transforms_focal_lengths_agree_with_angles(tmp_path):
         Scene.open(tmp_path)
 
 
+TIMES = {
+    "60 fps to milliseconds": ([round(k / 60, 3) for k in range(4)], 60),
+    "120 fps to milliseconds": ([round(k / 120, 3) for k in range(4)], 120),
+    "whole milliseconds": ([0, 17, 33, 50], 0.06),
+    "since 1970": ([1.7e9 + k / 30 for k in range(4)], 30),
+    "nanoseconds since 1970": ([1_700_000_000_000_000_000 + 40_000_000 * k for k in range(4)], 25e-9),
+}
+
+
+@pytest.mark.parametrize("kind", TIMES)
+def test_transforms_times_as_clocks_write_them(tmp_path, kind):
+    write_transforms(tmp_path, make_scene())
+    times, rate = TIMES[kind]
+
+    def change(late):
+        def edit(content):
+            content.pop("fps", None)
+            steps = sorted({frame["time"] for frame in content["frames"]})
+            for frame in content["frames"]:
+                step = steps.index(frame["time"])
+                frame["time"] = times[step] + late * (step > 1) * (times[2] - times[1])
+
+        return edit
+
+    edit_json(tmp_path / "transforms.json", change(0))
+    assert Scene.open(tmp_path).fps == pytest.approx(rate, rel=0.02)
+    edit_json(tmp_path / "transforms.json", change(0.5))
+    with pytest.raises(InputError, match="times must be evenly spaced"):
+        Scene.open(tmp_path)
+
+
 def test_transforms_paths_of_windows(tmp_path):
     write_transforms(tmp_path, make_scene())
     expected = Scene.open(tmp_path).images([0, 1], [0])
