@@ -14,6 +14,7 @@ from gsim3d.data.video_file import Video
 from gsim3d.data.videos import VIDEO_SUFFIXES
 from gsim3d.errors import InputError
 from gsim3d.io.files import opencv_path
+from gsim3d.io.terminal import progress
 
 BOARD = "board"  # folder with films of the board
 MOTION_WIDTH = 160  # pixels, of the images in which motion is measured
@@ -44,7 +45,7 @@ class Film:
 
     def grey(self, numbers: Sequence[int]):
         """Yields the frames of ascending ``numbers``, uint8 [h, w]."""
-        for image in self.video.read(numbers, Problems()):
+        for image in progress(self.video.read(numbers, Problems()), self.name, len(numbers), unit="frame"):
             yield cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
 
     def nearest(self, times: np.ndarray) -> list[int]:

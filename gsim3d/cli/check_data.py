@@ -40,6 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     import os
     from concurrent.futures import ThreadPoolExecutor
+    from functools import partial
 
     from gsim3d.data import find_scenes
     from gsim3d.data.check import check_scene, contact_sheet, describe
@@ -50,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     folders = find_scenes(args.data)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         hidden = args.quiet or len(folders) == 1
-        checks = pool.map(check_scene, folders)
+        checks = pool.map(partial(check_scene, quiet=args.quiet or len(folders) > 1), folders)
         checks = list(progress(checks, "scenes", len(folders), unit="scene", quiet=hidden))
     for check in checks:
         if check.problems or not args.quiet:

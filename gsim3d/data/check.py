@@ -12,7 +12,7 @@ from gsim3d.data.cameras import check_directions, positions_and_axes, project
 from gsim3d.data.recording import MOVING, Problems, Recording, evenly_spaced
 from gsim3d.data.scene import Scene
 from gsim3d.errors import InputError
-from gsim3d.io.terminal import plain
+from gsim3d.io.terminal import plain, progress
 
 SHEET = 1440  # pixels, target width of the contact sheet
 TILE = 200, 420  # pixels, smallest and largest height of one frame
@@ -38,8 +38,8 @@ class SceneCheck:
     problems: tuple[str, ...]  #: one message per line, in the order found
 
 
-def check_scene(folder: str | Path) -> SceneCheck:
-    """Reads every image of a scene folder and returns all problems found."""
+def check_scene(folder: str | Path, quiet: bool = True) -> SceneCheck:
+    """Reads every image of a scene folder and returns all problems found; unless ``quiet``, shows progress."""
     path, problems = Path(folder), Problems(collect=True)
     recording = scene = None
     try:
@@ -50,24 +50,28 @@ def check_scene(folder: str | Path) -> SceneCheck:
     except InputError as error:
         problems.add(str(error))
     if recording is not None:
-        for cam, name in enumerate(recording.camera_names):
-            try:
-                for _ in recording.read_images(cam, range(recording.n_steps), problems):
-                    pass
-            except InputError as error:
-                problems.add(f"camera {name}: {error}")
-        if recording.read_labels is not None:
-            _check_labels(recording, problems)
+        kinds = 1 + (recording.read_labels is not None)
+        total = kinds * len(recording.camera_names) * recording.n_steps
+        with progress(None, "images", total, unit="image", quiet=quiet) as bar:
+            for cam, name in enumerate(recording.camera_names):
+                try:
+                    for _ in recording.read_images(cam, range(recording.n_steps), problems):
+                        bar.update()
+                except InputError as error:
+                    problems.add(f"camera {name}: {error}")
+            if recording.read_labels is not None:
+                _check_labels(recording, problems, bar)
     if scene is not None and not problems.found:
         _check_agreement(Scene(path, recording), problems)  # a second Scene, so that its decoded images are freed
     return SceneCheck(path, scene, tuple(dict.fromkeys(problems.found)))
 
 
-def _check_labels(recording: Recording, problems: Problems) -> None:
+def _check_labels(recording: Recording, problems: Problems, bar) -> None:
     before, seen = len(problems.found), set()
     for cam, name in enumerate(recording.camera_names):
         try:
             for labels in recording.read_labels(cam, range(recording.n_steps), problems):
+                bar.update()
                 if labels is not None:
                     seen |= set(np.flatnonzero(np.bincount(labels.ravel(), minlength=256)).tolist())
         except InputError as error:

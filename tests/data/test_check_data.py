@@ -1,6 +1,7 @@
 """gsim3d check-data: every problem of every scene, exit codes, and what the contact sheet shows."""
 
 import os
+import sys
 from pathlib import Path
 
 import cv2
@@ -140,3 +141,11 @@ def test_check_data_escapes_names_that_are_not_utf8(tmp_path, capsys):
     assert main(["check-data", str(folder), "--out", str(tmp_path / "sheet.png")]) == 0
     assert "sc\\udcff\\x1bne" in capsys.readouterr().out
     assert cv2.imread(str(tmp_path / "sheet.png")) is not None
+
+
+def test_check_data_shows_the_progress_of_one_scene(tmp_path, capsys, monkeypatch):
+    write_genesis(tmp_path, make_scene())
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    for options, shown in (([], True), (["--quiet"], False)):
+        assert main(["check-data", str(tmp_path), *options]) == 0
+        assert ("24/24" in capsys.readouterr().err) == shown  # images and labels of 3 cameras, 4 steps
