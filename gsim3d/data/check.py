@@ -50,8 +50,7 @@ def check_scene(folder: str | Path, quiet: bool = True) -> SceneCheck:
     except InputError as error:
         problems.add(str(error))
     if recording is not None:
-        kinds = 1 + (recording.read_labels is not None)
-        total = kinds * len(recording.camera_names) * recording.n_steps
+        total = (1 + (recording.read_labels is not None)) * len(recording.camera_names) * recording.n_steps
         with progress(None, "images", total, unit="image", quiet=quiet) as bar:
             for cam, name in enumerate(recording.camera_names):
                 try:

@@ -43,8 +43,7 @@ def _png(data: bytes) -> Header | None:
     at, alpha, whole, refused = 8, data[25] in (4, 6), False, ""
     while at + 12 <= len(data) and not whole:
         kind = data[at + 4 : at + 8]
-        alpha, whole = alpha or kind == b"tRNS", kind == b"IEND"
-        refused = "is animated" if kind == b"acTL" else refused
+        alpha, whole, refused = alpha or kind == b"tRNS", kind == b"IEND", refused or "is animated" * (kind == b"acTL")
         at += 12 + int.from_bytes(data[at : at + 4], "big")
     return Header(struct.unpack_from(">II", data, 16), whole, alpha, refused)
 

@@ -1,8 +1,7 @@
 """Reader of HO-Cap sequences: eight synchronised cameras, segmentation, and hand joints as actions.
 
 Both versions of the layout are read: YAML descriptions with label_<frame>.npz, and the older JSON descriptions with
-mask_<frame>.png and no joints. World = the frame of calibration tag 1: metres, z up, the table near z = 0. All keys:
-docs/reference/data.md.
+mask_<frame>.png and no joints. World = the frame of calibration tag 1: metres, z up, the table near z = 0.
 """
 
 import io

@@ -35,7 +35,6 @@ OTHER_KEY = re.compile(
 )
 MODEL_KEY = re.compile(r"(camera|lens|projection|distortion)?(type|model|mode|projection)|lens")
 OTHER_MODEL = re.compile(r"fish|equi|omni|ftheta|spher|panoram|latlong|kannala|prism|^(kb\d?|mei|ds|eucm|ucm|fov)$")
-MAX_NESTED = 3  # levels of objects in which lens keys are searched
 SAMPLES = 2000  # angles at which the distorted radius is sampled
 WIDEST = 1.55  # radians from the optical axis; a pinhole image covers less than 90 degrees
 
@@ -86,7 +85,7 @@ def _unread(values: Mapping, level: int = 0) -> str | None:
             found = OTHER_KEY.fullmatch(name) and _is_set(value)
         if found:
             return str(key)
-        inner = _unread(value, level + 1) if isinstance(value, Mapping) and level < MAX_NESTED else None
+        inner = _unread(value, level + 1) if isinstance(value, Mapping) and level < 3 else None
         if inner:
             return f"{key}.{inner}"
     return None

@@ -19,7 +19,7 @@ MAX_STEPS, MAX_CAMS, MAX_SIZE = 1_000_000, 10_000, 16_384  # larger values are r
 MAX_NUMBER = 1e9  # metres, pixels, seconds; larger values are rejected as errors
 MAX_NAME = 200  # characters of a file name
 HALF_PAIR = re.compile(r"\\u[dD][89a-fA-F]")  # JSON escape of a surrogate, possibly unpaired
-SPACING_TOLERANCE, MAX_ROUNDING = 0.05, 0.25  # largest deviation from even spacing in steps, of rounded times
+SPACING_TOLERANCE, MAX_ROUNDING = 0.05, 0.25  # largest deviation from even spacing in steps, of times rounded to ms
 BACKGROUND, FIXED, MOVING = 0, 1, 3  # pixel labels: background, static geometry, movable bodies
 
 # (camera, ascending steps, problems) -> one image per step; None on error
@@ -196,9 +196,7 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def array(
-    value: Any, shapes: Sequence[tuple[int, ...]], what: str, problems: Problems, most: float = MAX_NUMBER
-) -> np.ndarray | None:
+def array(value: Any, shapes: Sequence[tuple], what: str, problems: Problems, most=MAX_NUMBER) -> np.ndarray | None:
     """Converts ``value`` to a finite float64 array of one of ``shapes``; reports errors of ``what``, returns None."""
     if value is None:
         problems.add(f"{what} is missing")
@@ -306,7 +304,6 @@ def step_rate(times: np.ndarray) -> tuple[float, int | None]:
     gaps = np.diff(times)
     rate = len(gaps) / (times[-1] - times[0])
     late = np.abs((times - times[0]) * rate - np.arange(len(times)))  # in steps
-    # Times may be rounded, at 60 fps to 0.017, 0.033, 0.05.
     digits = (unit for unit in (1, 0.1, 0.01, 1e-3) if np.abs(times / unit - np.round(times / unit)).max() < 1e-6)
     if late.max() <= max(SPACING_TOLERANCE, min(1.01 * rate * next(digits, 0), MAX_ROUNDING)):
         return float(rate), None

@@ -24,8 +24,7 @@ SPLITS = ("transforms_train.json", "transforms_val.json", "transforms_test.json"
 ANGLES = ("camera_angle_x", "camera_angle_y")
 OWN = ("frames", "file_path", "transform_matrix", "time", "camera", "mask_path", "label_path")  # never defaults
 SAME_FOCAL = 0.02  # relative difference between focal lengths given as such and as angles
-MAX_TIME = 1e19  # nanoseconds since 1970 are below
-SAME_TIME = 1e-6  # fraction of the duration; closer times belong to one step
+MAX_TIME, SAME_TIME = 1e19, 1e-6  # nanoseconds since 1970 are below; fraction of the duration that is one step
 
 
 def recognises(folder: Path) -> bool:

@@ -1,8 +1,7 @@
 """Reader of videos: cameras.json, and for each camera a video file or a folder of numbered frames.
 
 Cameras are synchronised by time: frame n of a folder is at n / fps seconds, frames of a video at their time stamps.
-Labels come from the folders labels or masks, or else from alpha, or else from background subtraction. All keys:
-docs/reference/data.md.
+Labels come from the folders labels or masks, or else from alpha, or else from background subtraction.
 """
 
 from __future__ import annotations

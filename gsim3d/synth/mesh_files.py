@@ -17,16 +17,16 @@ from gsim3d.io.files import read_file
 SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 MAX_MESH, MAX_TEXTURE = 1 << 28, 1 << 28  # largest file in bytes
 SLOTS = 3  # largest number of channels of a corner
-CHANGES = ("-s", "-o", "-t", "-mm", "-clamp", "-imfchan")  # options of map_Kd that change the picture, unless ...
+CHANGES = ("-s", "-o", "-t", "-mm", "-clamp", "-imfchan")  # options of map_Kd, unless ...
 UNCHANGED = re.compile(r"-s( 1(\.0*)?)+|-[ot]( 0(\.0*)?)+|-mm 0 1|-clamp off")
-READ_EXTENSIONS = rb"KHR_(?:materials_\w+|lights_punctual)"
 # What trimesh drops, by suffix; glTF files also for what they require.
 DROPPED = {
     ".ply": rb"property \w+ (r|(?:diffuse|ambient)_red)\s",
     **dict.fromkeys(
         (".glb", ".gltf"),
-        rb'"(KHR_texture_transform|sparse)"|"extensionsRequired"\s*:\s*\[\s*(?:"%b"[\s,]*)*"(\w+)|'
-        rb'"baseColorTexture"\s*:\s*\{[^{}]*"(texCoord)"\s*:\s*[1-9]' % READ_EXTENSIONS,
+        rb'"(KHR_texture_transform|sparse)"|'
+        rb'"extensionsRequired"\s*:\s*\[\s*(?:"KHR_(?:materials_\w+|lights_punctual)"[\s,]*)*"(\w+)|'
+        rb'"baseColorTexture"\s*:\s*\{[^{}]*"(texCoord)"\s*:\s*[1-9]',
     ),
 }
 
@@ -222,8 +222,7 @@ def _read_other(path: Path, data: bytes) -> list[Piece]:
 
     kind = path.suffix.lower()
     if kind == ".off" and _has_off_colours(data) or kind == ".stl" and _has_stl_colours(data):
-        which = kind[1:].upper()
-        raise InputError(f"mesh {path} has colours, which are not supported in {which} files: save it as PLY or OBJ")
+        raise InputError(f"mesh {path} has colours, which are not supported in {kind[1:].upper()}: use PLY or OBJ")
     dropped = re.search(DROPPED.get(kind, rb"(?!)"), data[: 1 << 16] if kind == ".ply" else data)
     if dropped:
         what = next(filter(None, dropped.groups())).decode()

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from gsim3d.effects.spec import AppearanceEffects, DynamicsEffects, EffectsSpec, OutputEffects
-from gsim3d.errors import InputError, did_you_mean
+from gsim3d.errors import InputError, check_ranges, did_you_mean
 from gsim3d.synth import cameras, render, scene_setup, shapes, writer
 from gsim3d.synth.bodies import OBJECTS, load_mesh, mesh_bytes, mesh_name
 from gsim3d.synth.embedding import Embedding, grid_faces
@@ -111,19 +111,12 @@ class World(ABC):
         for field in ("max_timestep", "distance", "fov", "ground_radius", "near"):
             if not 0 < getattr(self, field) < np.inf:
                 raise InputError(f"{field} must be positive; got {getattr(self, field)!r}")
-        if not RATES[0] <= self.fps <= RATES[1]:
-            raise InputError(f"fps must be from {RATES[0]} to {RATES[1]}; got {self.fps!r}")
+        check_ranges(self, fps=RATES, camera_spread=(0, MAX_SPREAD), ground_albedo=(0, 1), seed=(0, np.inf))
         self._check_ranges("body_size", "drop_height", "n_bodies")
         if not self.near < self.far < np.inf:
             raise InputError(f"far must be above near; got near {self.near} and far {self.far}")
         if self.depth and self.far > writer.MAX_DEPTH:
             raise InputError(f"far must be at most {writer.MAX_DEPTH} m with depth images; got {self.far}")
-        if not 0 <= self.camera_spread <= MAX_SPREAD:
-            raise InputError(f"camera_spread must be from 0 to {MAX_SPREAD:g}; got {self.camera_spread!r}")
-        if self.ground_albedo is not None and not 0 <= self.ground_albedo <= 1:
-            raise InputError(f"ground_albedo must be from 0 to 1, or None; got {self.ground_albedo!r}")
-        if not self.seed >= 0:
-            raise InputError(f"seed must be 0 or more; got {self.seed}")
         for field, allowed in (("background", BACKGROUNDS), ("mesh_up", MESH_UPS), ("engine", self.engines)):
             if (value := getattr(self, field)) not in allowed:
                 hint = did_you_mean(value, allowed)
@@ -134,10 +127,9 @@ class World(ABC):
                 raise InputError(f"object {name!r} is not known; choose from {known}{hint}")
         names = self.object_names()
         repeated = [name for name, count in Counter(names).items() if count > 1]
-        if not names:
-            raise InputError("objects: there is neither an object nor a mesh file to simulate")
-        if repeated:
-            raise InputError(f"objects and mesh files must have different names; repeated: {', '.join(repeated)}")
+        if repeated or not names:
+            wrong = f"different names; repeated: {', '.join(repeated)}" if names else "one name at least"
+            raise InputError(f"objects and mesh files must have {wrong}")
         for path in self.meshes:
             load_mesh(path, self.mesh_up)
         if self.ground:
