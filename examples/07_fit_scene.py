@@ -16,11 +16,15 @@ from gsim3d.compat.gsplat import rasterization
 
 parser = argparse.ArgumentParser()
 parser.add_argument("--data", help=".npz with means3d [N, 3], colors [N, 3] of 0 to 255 and viewmats [C, 4, 4]")
-parser.add_argument("--steps", type=int, default=300)
-parser.add_argument("--width", type=int, default=64)
+parser.add_argument("--steps", type=int, default=300, help="of optimisation, one image each")
+parser.add_argument("--width", type=int, default=64, help="pixels of an image, 4:3")
 parser.add_argument("--cameras", type=int, default=24, help="on a circle; every sixth is held out")
 parser.add_argument("--beside", choices=["gsplat"], help="also fit with this package's rasterization")
 options = parser.parse_args()
+if options.steps < 1 or options.width < 2 or options.cameras < 2:
+    parser.error("--steps must be at least 1, --width and --cameras at least 2")
+if options.beside:
+    from gsplat import rasterization as beside
 device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 width, height = options.width, options.width * 3 // 4
 RATES = {"means": 1.6e-4, "quats": 1e-3, "scales": 5e-3, "opacities": 5e-2, "colors": 2.5e-3}
@@ -179,6 +183,4 @@ some = points[torch.randperm(len(points))[: len(points) // 4]]
 some = some + 0.5 * third_neighbour(some) * torch.randn_like(some)
 fit("gsim3d", rasterization, some, radius, viewmats, K, images)
 if options.beside:
-    from gsplat import rasterization as other
-
-    fit("gsplat", other, some, radius, viewmats, K, images)
+    fit("gsplat", beside, some, radius, viewmats, K, images)

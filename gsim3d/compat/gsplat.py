@@ -132,7 +132,7 @@ def rasterization(
         "external_distortion_coeffs": external_distortion_coeffs, "viewmats_rs": viewmats_rs, "ut_params": ut_params,
         "rolling_shutter": None if getattr(rolling_shutter, "name", "") == "GLOBAL" else rolling_shutter,
         "extra_signals": extra_signals, "extra_signals_sh_degree": extra_signals_sh_degree,
-        "renderer_config": renderer_config,
+        "renderer_config": renderer_config, "absgrad under torch.compile": absgrad and torch.compiler.is_compiling(),
     }  # fmt: skip
     _refuse(offered, {"camera_model": (camera_model, LENSES), "render_mode": (render_mode, RENDER_MODES),
                       "rasterize_mode": (rasterize_mode, RASTERIZE_MODES)})  # fmt: skip

@@ -264,6 +264,18 @@ def test_what_is_not_offered_is_refused_by_name(name, value):
         rasterization(**scene_of(), **SIZE, **{name: value})
 
 
+def test_absgrad_is_refused_while_compiling_and_works_beside():
+    arguments = scene_of()
+    arguments["means"].requires_grad_()
+
+    def loss(means):
+        return rasterization(**arguments | {"means": means}, **SIZE, packed=False, absgrad=True)[0].sum()
+
+    with pytest.raises(Exception, match="absgrad under torch.compile is not offered"):
+        torch.compile(loss, fullgraph=True, backend="eager")(arguments["means"])
+    assert torch.compile(loss, backend="eager")(arguments["means"]) == loss(arguments["means"])
+
+
 def test_wrong_shapes_are_named():
     arguments = scene_of()
     for name in ("means", "quats", "opacities", "viewmats", "Ks", "colors"):
