@@ -27,17 +27,7 @@ from torch import Tensor, nn
 
 from gsim3d.cameras import Cameras, Frames, FrameSource
 from gsim3d.cuda_graphs import Prediction
-from gsim3d.dynamics import (
-    Dynamics,
-    FrozenContext,
-    RestLog,
-    Sleepers,
-    append_step,
-    concatenate,
-    last_steps,
-    rollout,
-    rollout_in_parts,
-)
+from gsim3d.dynamics import Dynamics, FrozenContext, RestLog, Sleepers, rollout, rollout_in_parts
 from gsim3d.effects.actors import Actor, Actors
 from gsim3d.effects.edits import Edit, by_step, structure_of
 from gsim3d.effects.plan import Plan, by_plan, make_plan, unused_parameters
@@ -56,7 +46,7 @@ from gsim3d.ops.curve import Pyramid
 from gsim3d.ops.raster import Rendering
 from gsim3d.presets import ModelConfig
 from gsim3d.pretrained import loading
-from gsim3d.state import DYNAMIC, FROZEN, Gaussians, Particles
+from gsim3d.state import DYNAMIC, FROZEN, Gaussians, Particles, append_step, concatenate, last_steps
 
 
 class Simulator(nn.Module):

@@ -11,10 +11,10 @@ sizes = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(sizes)
 # What is still above its limit may shrink and not grow.
 TODAY = {
-    "lines of the package": 45_919,
-    "lines of the library without io": 15_829,
+    "lines of the package": 45_894,
+    "lines of the library without io": 15_804,
     "lines of readers, writers and the viewer": 4_534,
-    "words of documentation without notes and CHANGELOG": 25_066,
+    "words of documentation without notes and CHANGELOG": 25_065,
 }
 
 

@@ -20,15 +20,10 @@ KINDS = {"all": None, "moving": DYNAMIC, "frozen": FROZEN}
 
 @dataclass(frozen=True)
 class Selection:
-    """A selection of particles.
+    """A selection of particles."""
 
-    Attributes:
-        which: "moving", "frozen" (the static background) or "all".
-        box: lowest and highest corner in world coordinates (m); None: unlimited.
-    """
-
-    which: str = "moving"
-    box: Box | None = None
+    which: str = "moving"  #: "moving", "frozen" (the static background) or "all"
+    box: Box | None = None  #: lowest and highest corner in world coordinates (m); None: unlimited
 
     alone: ClassVar[str] = "which"  # field that a plain string in a file sets
 

@@ -137,10 +137,8 @@ class Interaction(nn.Module):
 class GraphNetwork(nn.Module):
     """Features of all clouds -> features [N, channels] of the same particles, and a head.
 
-    Args of forward:
-        x: [N, 3 + in_channels], positions in cells, then features of the particles of stage 0.
-        pyramid: their geometry, of :func:`graph_spec`.
-        generator, contexts: of :class:`gsim3d.nn.point_transformer.PointTransformer`, not used.
+    It reads x [N, 3 + in_channels], positions in cells, then features of the particles of stage 0, and their geometry
+    of :func:`graph_spec`; not what else :class:`gsim3d.nn.point_transformer.PointTransformer` reads.
     """
 
     def __init__(

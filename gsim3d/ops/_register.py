@@ -132,13 +132,6 @@ def one_by_one(op: str) -> Callable:
     return batched
 
 
-def folded_segments(size: int, rows: Tensor, cu_rows: Tensor, n_rows: int) -> tuple[Tensor, Tensor]:
-    """Segments of ``size`` matrices of ``n_rows`` rows, one below the other; each has one more, of the rows in none."""
-    entry = torch.arange(size, device=rows.device)[:, None]
-    last = rows.new_full((1,), size * rows.shape[0])
-    return (rows + n_rows * entry).flatten(), torch.cat([(cu_rows + rows.shape[0] * entry).flatten(), last])
-
-
 def register_autocast(op: str, rule: str | Callable[[str, Sequence[Any]], Sequence[Any]]) -> None:
     """What gsim3d::``op`` computes in under ``torch.autocast``: "float32"; "follow": the same on the CPU, and
     autocast's dtype on CUDA (float64 stays, as in torch); or by a function (device, arguments) -> arguments."""

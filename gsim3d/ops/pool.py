@@ -5,15 +5,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from gsim3d.ops._arguments import as_given, check_numbers, check_tensors, check_whole, widened, within_memory
-from gsim3d.ops._register import (
-    call,
-    expanded,
-    fakes,
-    folded_segments,
-    one_by_one,
-    register_autocast,
-    register_gradients,
-)
+from gsim3d.ops._register import call, expanded, fakes, one_by_one, register_autocast, register_gradients
 
 
 def pool_max(x: Tensor, rows: Tensor, cu_rows: Tensor, *, check: bool = True) -> Tensor:
@@ -172,6 +164,13 @@ def _linear_jvp(op):
     return lambda inputs, tangents, outputs: call(op, tangents[0], *inputs[1:])
 
 
+def _folded_segments(size: int, rows: Tensor, cu_rows: Tensor, n_rows: int) -> tuple[Tensor, Tensor]:
+    """Segments of ``size`` matrices of ``n_rows`` rows, one below the other; each has one more, of the rows in none."""
+    entry = torch.arange(size, device=rows.device)[:, None]
+    last = rows.new_full((1,), size * rows.shape[0])
+    return (rows + n_rows * entry).flatten(), torch.cat([(cu_rows + rows.shape[0] * entry).flatten(), last])
+
+
 def _batched_lists(op, has_segments: bool, gives_segments: bool):
     """Matrices in one call, one below the other. ``has_segments``, ``gives_segments``: x, out have a row a segment."""
 
@@ -181,7 +180,7 @@ def _batched_lists(op, has_segments: bool, gives_segments: bool):
         x, rows, cu_rows, *n_rows = inputs
         n = n_rows[0] if n_rows else x.shape[1]
         x = F.pad(x, (0, 0, 0, 1)) if has_segments else x
-        lists = folded_segments(size, rows, cu_rows, n)
+        lists = _folded_segments(size, rows, cu_rows, n)
         result = call(op, x.flatten(0, 1), *lists, *(size * n for n in n_rows))
         out = (result[0] if isinstance(result, tuple) else result).unflatten(0, (size, -1))
         out = out[:, :-1] if gives_segments else out
