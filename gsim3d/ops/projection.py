@@ -136,7 +136,8 @@ def project_gaussians(
         *(near_plane, far_plane, radius_clip, dilation, LENSES[lens], jacobian == "clamped", antialiased),
     )
     made = within_memory(OP, f"n_pairs={n_pairs}", torch.ops.gsim3d.project_gaussians, *args)
-    return Projection(*made, cu_pairs)
+    means2d, conics, depths, radii, compensations = made
+    return Projection(means2d, conics, depths, radii, compensations, cu_pairs)
 
 
 def lens_limits(lens: str, distortion: Tensor) -> Tensor:
