@@ -142,8 +142,8 @@ def rasterization(
     optional |= {"colors": colors, "backgrounds": backgrounds} if with_color else {}
     _check(camera_model, means, viewmats, Ks, opacities, optional)
     batch, n, n_cameras = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
-    n_batches = math.prod(batch)
-    n_images = n_batches * n_cameras
+    viewmats, Ks = viewmats.to(means.dtype), Ks.to(means.dtype)
+    n_batches, n_images = math.prod(batch), math.prod((*batch, n_cameras))
     antialiased = rasterize_mode == "antialiased"
 
     lens, distortion = _lens(LENSES[camera_model], radial_coeffs, tangential_coeffs, n_images)

@@ -176,6 +176,13 @@ def test_harmonics(device, batch, sh_degree):
     assert_close_relative_to_max(color, expected, 1e-12)
 
 
+def test_cameras_are_cast_to_the_dtype_of_the_means():
+    arguments = scene_of(dtype=torch.float32) | {"colors": torch.randn(40, 4, 3)}
+    expected = rasterization(**arguments, **SIZE, sh_degree=1)[0]
+    cameras = {name: arguments[name].double() for name in ("viewmats", "Ks")}
+    assert_same_bits(rasterization(**arguments | cameras, **SIZE, sh_degree=1)[0], expected)
+
+
 def test_distorted_cameras(device):
     arguments = {name: x.to(device) for name, x in scene_of(cameras=1).items()}
     radial = torch.tensor([[0.1, 0.02, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64, device=device).requires_grad_()
