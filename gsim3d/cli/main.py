@@ -34,6 +34,7 @@ COMMANDS = {
     "doctor": ("gsim3d.cli.doctor", "what is installed, what was compiled, and whether every kernel works here"),
 }
 RENAMED = {"pareto": "profile"}
+LONGEST = 2000  # characters of an error; names of files may be longer
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -115,5 +116,7 @@ def _show_warning(otherwise, message, category, *location, **more) -> None:
 
 
 def _fail(message: str) -> int:
-    print(f"gsim3d: error: {' '.join(message.split())}", file=sys.stderr)
+    text = " ".join(message.split())
+    text = text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"
+    print(f"gsim3d: error: {text}", file=sys.stderr)
     return 2

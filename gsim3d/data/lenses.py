@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -78,17 +79,22 @@ def _unread(values: Mapping, level: int = 0) -> str | None:
     for key, value in values.items():
         if not level and key in READ:
             continue
-        name = _plain(key)
-        if isinstance(value, str) and MODEL_KEY.fullmatch(name):
-            found = OTHER_MODEL.search(_plain(value))
-        else:
-            found = OTHER_KEY.fullmatch(name) and _is_set(value)
+        is_model, is_other = _kind(str(key)[:80])
+        found = (
+            OTHER_MODEL.search(_plain(value)) if is_model and isinstance(value, str) else is_other and _is_set(value)
+        )
         if found:
             return str(key)
         inner = _unread(value, level + 1) if isinstance(value, Mapping) and level < 3 else None
         if inner:
             return f"{key}.{inner}"
     return None
+
+
+@lru_cache(10_000)
+def _kind(key: str) -> tuple[bool, bool]:
+    """Returns whether a key names a lens model, and whether it is another name of a lens key."""
+    return tuple(bool(pattern.fullmatch(_plain(key))) for pattern in (MODEL_KEY, OTHER_KEY))
 
 
 def _plain(name: object) -> str:

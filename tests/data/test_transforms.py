@@ -138,6 +138,13 @@ def test_transforms_times_as_clocks_write_them(tmp_path, kind):
         Scene.open(tmp_path)
 
 
+def test_transforms_defaults_of_frames_are_bounded(tmp_path):
+    write_transforms(tmp_path, make_scene())
+    edit_json(tmp_path / "transforms.json", lambda content: content.update({f"key {i}": i for i in range(201)}))
+    with pytest.raises(InputError, match="keys beside frames exceed the limit of 200"):
+        Scene.open(tmp_path)
+
+
 def test_transforms_paths_of_windows(tmp_path):
     write_transforms(tmp_path, make_scene())
     expected = Scene.open(tmp_path).images([0, 1], [0])

@@ -137,6 +137,12 @@ def test_commands_suggest_near_words(tmp_path, capsys, arguments, message):
     assert err.count("\n") == 1 and re.search(re.sub(r"([?()])", r"\\\1", message), err), err
 
 
+def test_errors_are_bounded(tmp_path, capsys):
+    (tmp_path / "a.obj").write_text(f"mtllib {'a' * 100_000}\nusemtl b\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    assert main(["generate", "elastic", "--out", str(tmp_path / "new"), "--mesh", str(tmp_path / "a.obj")]) == 2
+    assert len(capsys.readouterr().err) < 2100
+
+
 def test_did_you_mean_ignores_distant_words():
     assert did_you_mean("xyzzy", ["train", "plan"]) == "" and did_you_mean(None, ["plan"]) == ""
     assert did_you_mean("TRAIN", ["train", "plan"]) == "; did you mean train?"
