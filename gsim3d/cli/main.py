@@ -34,7 +34,6 @@ COMMANDS = {
     "doctor": ("gsim3d.cli.doctor", "what is installed, what was compiled, and whether every kernel works here"),
 }
 RENAMED = {"pareto": "profile"}
-LONGEST = 2000  # characters of an error; names of files may be longer
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -116,7 +115,5 @@ def _show_warning(otherwise, message, category, *location, **more) -> None:
 
 
 def _fail(message: str) -> int:
-    text = " ".join(message.split())
-    text = text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"
-    print(f"gsim3d: error: {text}", file=sys.stderr)
+    print(f"gsim3d: error: {' '.join(message.split())[:2000]}", file=sys.stderr)  # names of files may be longer
     return 2

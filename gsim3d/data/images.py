@@ -116,8 +116,7 @@ def as_mask(image: np.ndarray, file: Path | None, frame: str, problems: Problems
     """Converts a mask to labels uint8 [h, w]: MOVING where it is set, else BACKGROUND.
 
     Binary masks, including those with compression noise or soft borders, are thresholded at half of their range; label
-    images are set where they are not 0. Colour images are reduced to the maximum over channels; of images of one colour
-    alpha is the mask.
+    images are set where they are not 0. Colours are reduced to their maximum; of one colour, alpha is the mask.
     """
     is_cut_out = _has_alpha(image) and np.ptp(image[..., 3]) > 0 and (image[..., :3] == image[0, 0, :3]).all()
     grey = image[..., 3] if is_cut_out else _over_black(image)

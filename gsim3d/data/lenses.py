@@ -43,8 +43,7 @@ WIDEST = 1.55  # radians from the optical axis; a pinhole image covers less than
 def lens_of(values: Mapping, what: str, problems: Problems) -> Lens | None:
     """Parses the lens of a camera description; returns None for a pinhole. ``what``: the camera, for messages."""
     if key := _unread(values):
-        known = ", ".join(COEFFICIENTS)
-        problems.add(f"{what}: the lens key {key:.80} is not supported; use {known}, or undistort the images")
+        problems.add(f"{what}: the lens key {key:.80} is not supported; use k1 to k6, p1, p2, or undistort the images")
         return None
     model, flag = values.get("camera_model"), values.get("is_fisheye", False)
     if not isinstance(flag, bool):
@@ -80,13 +79,10 @@ def _unread(values: Mapping, level: int = 0) -> str | None:
         if not level and key in READ:
             continue
         is_model, is_other = _kind(str(key)[:80])
-        found = (
-            OTHER_MODEL.search(_plain(value)) if is_model and isinstance(value, str) else is_other and _is_set(value)
-        )
-        if found:
+        is_name = is_model and isinstance(value, str)
+        if OTHER_MODEL.search(_plain(value)) if is_name else is_other and _is_set(value):
             return str(key)
-        inner = _unread(value, level + 1) if isinstance(value, Mapping) and level < 3 else None
-        if inner:
+        if isinstance(value, Mapping) and level < 3 and (inner := _unread(value, level + 1)):
             return f"{key}.{inner}"
     return None
 

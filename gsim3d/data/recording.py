@@ -243,11 +243,7 @@ def read_json(file: Path) -> dict:
 
 
 def inside(folder: Path, relative: str, what: str) -> Path:
-    """Returns ``folder / relative``; backslashes separate folders unless the name of a file has them.
-
-    Raises:
-        InputError: it resolves to a path outside of ``folder``.
-    """
+    """Returns ``folder / relative``, a path of any system. Raises InputError if it is outside of ``folder``."""
     file = folder / relative
     try:
         if "\\" in relative and not file.exists():

@@ -23,7 +23,6 @@ FILE = "transforms.json"
 SPLITS = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 ANGLES = ("camera_angle_x", "camera_angle_y")
 OWN = ("frames", "file_path", "transform_matrix", "time", "camera", "mask_path", "label_path")  # never defaults
-MAX_SHARED = 200  # keys that are defaults of every frame
 SAME_FOCAL = 0.02  # relative difference between focal lengths given as such and as angles
 MAX_TIME, SAME_TIME = 1e19, 1e-6  # nanoseconds since 1970 are below; fraction of the duration that is one step
 
@@ -114,8 +113,8 @@ def frames_of(folder: Path, source: Path, description: dict) -> list[dict]:
                 raise InputError(f"{source}: frames[{number}].{key} must be a string; got {str(frame.get(key))[:80]!r}")
             inside(folder, frame[key], f"{source}: frames[{number}].{key}")
     shared = {key: value for key, value in description.items() if key not in OWN}
-    if len(shared) > MAX_SHARED:
-        raise InputError(f"{source}: {len(shared)} keys beside frames exceed the limit of {MAX_SHARED}")
+    if len(shared) > 200:
+        raise InputError(f"{source}: {len(shared)} keys beside frames exceed the limit of 200")
     without_angles = {key: value for key, value in shared.items() if key not in ANGLES}
     return [{**(without_angles if "fl_x" in frame else shared), **frame} for frame in frames]
 
