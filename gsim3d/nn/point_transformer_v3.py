@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from gsim3d import ops
-from gsim3d.errors import InputError, check_one_of
+from gsim3d.errors import InputError, check_one_of, check_ranges
 from gsim3d.nn.point_transformer import (
     Block,
     Pool,
@@ -74,6 +74,7 @@ class PointTransformerV3Config:
         check_one_of(f"{name}: depth_rule", self.depth_rule, DEPTH_RULES)
         if not 1 <= len(self.curves) <= N_LISTS or not set(self.curves) <= set(CURVES):
             raise InputError(f"{name}: curves must be 1 to {N_LISTS} of {', '.join(CURVES)}; got {self.curves}")
+        check_ranges(self, in_channels=(1, 10**5))
         self.layers()
 
     def layers(self) -> TransformerConfig:
@@ -181,9 +182,8 @@ class PointTransformerV3(nn.Module):
         for row in permutations:
             ids = [ids[r] for r in row]
             curves.append(tuple(ids[r % n_curves] for r in range(N_LISTS)))
-        n_clouds = cu_rows.shape[0] - 1
-        clouds = torch.arange(n_clouds, device=cells.device)
-        origin = torch.zeros(n_clouds, 3, dtype=torch.float64, device=cells.device)
+        clouds = torch.arange(len(cu_rows) - 1, device=cells.device)
+        origin = torch.zeros(len(clouds), 3, dtype=torch.float64, device=cells.device)
         places, slots = cells.double() + 0.5, torch.zeros_like(clouds)
         made = ops.build_pyramid(places, cu_rows, clouds, slots, origin, spec, curves=tuple(curves), depth=depth)
         stages = [dataclasses.replace(stage, patches=stage.patches[:n_curves]) for stage in made.stages]

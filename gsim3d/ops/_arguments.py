@@ -49,7 +49,7 @@ def check_floating(op: str, narrow: dict[str, Tensor | None] | None = None, **fi
                 raise ValueError(f"{op}: {other} must be {dtype}, as {name}, or of 16 bits; got {x.dtype}")
 
 
-def check_ranges(op: str, n: int, **offsets: Tensor | None) -> None:
+def check_splits(op: str, n: int, **offsets: Tensor | None) -> None:
     """Raises ValueError, naming the argument, unless offsets are int64 and, on the CPU, ascend from 0 to ``n``."""
     for name, cu in offsets.items():
         if cu is None:

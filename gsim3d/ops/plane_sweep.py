@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.errors import NumericalError
-from gsim3d.ops._arguments import check_floating, check_numbers, check_ranges, check_tensors
+from gsim3d.ops._arguments import check_floating, check_numbers, check_splits, check_tensors
 from gsim3d.ops._register import fakes, register_autocast, register_gradients, save_inputs
 
 
@@ -81,7 +81,7 @@ def _check_geometry(Ks: Tensor, viewmats: Tensor, src_images: Tensor, cu_src: Te
     check_numbers(op, **matrices)
     if n_pairs and not (int(src_images.min()) >= 0 and int(src_images.max()) < n):
         raise ValueError(f"{op}: src_images must be in [0, {n})")
-    check_ranges(op, n_pairs, cu_src=cu_src)
+    check_splits(op, n_pairs, cu_src=cu_src)
 
 
 def plane_sweep(

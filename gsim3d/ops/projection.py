@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsim3d.cameras import Cameras
 from gsim3d.errors import check_one_of
-from gsim3d.ops._arguments import check_floating, check_numbers, check_ranges, check_real, check_tensors, within_memory
+from gsim3d.ops._arguments import check_floating, check_numbers, check_real, check_splits, check_tensors, within_memory
 from gsim3d.ops._register import fakes, register_autocast, register_gradients, save_inputs
 from gsim3d.ops.raster import LARGEST, check_scene
 
@@ -220,7 +220,7 @@ def _check(tensors: dict, cameras: Cameras, cu_rows: Tensor | None, sizes: dict,
     clouds = cameras.image_cloud
     if clouds.dtype != torch.int64 or clouds.dim() != 1:
         raise ValueError(f"{OP}: cameras.image_cloud must be int64 [I]; got {clouds.dtype} {list(clouds.shape)}")
-    check_ranges(OP, len(tensors["means"]), cu_rows=cu_rows)
+    check_splits(OP, len(tensors["means"]), cu_rows=cu_rows)
     distortion, n_images = tensors.get("distortion"), len(cameras)
     if distortion is not None:
         sizes = N_DISTORTION.get(lens, ())

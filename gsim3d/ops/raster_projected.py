@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsim3d.errors import check_one_of
-from gsim3d.ops._arguments import check_floating, check_numbers, check_ranges, check_tensors, check_whole, within_memory
+from gsim3d.ops._arguments import check_floating, check_numbers, check_splits, check_tensors, check_whole, within_memory
 from gsim3d.ops._register import fakes, register_autocast, register_gradients
 from gsim3d.ops.raster import CUTOFFS, LARGEST, Rendering, empty_images, grads_of_images, sizes_of_state, state_bytes
 
@@ -101,7 +101,7 @@ def _check(rows: dict[str, Tensor], optional: dict[str, Tensor], width: int, hei
     colors, cu_pairs, background = rows["colors"], optional.get("cu_pairs"), optional.get("background")
     if colors.dim() != 2 or colors.shape[0] != n or not colors.is_floating_point():
         raise ValueError(f"{OP}: colors must be [P={n}, D] of floats; got {colors.dtype} {list(colors.shape)}")
-    check_ranges(OP, n, cu_pairs=cu_pairs)
+    check_splits(OP, n, cu_pairs=cu_pairs)
     n_images, d = 1 if cu_pairs is None else cu_pairs.shape[0] - 1, colors.shape[1]
     if background is not None and background.shape not in ((d,), (n_images, d)):
         raise ValueError(f"{OP}: background must be [D={d}] or [I={n_images}, D]; got {list(background.shape)}")

@@ -161,6 +161,8 @@ def test_arguments_are_checked():
         model.pyramid(torch.zeros(1, 3, dtype=torch.int64), cu_rows, permutations=[[0, 1, 2, 3]])
     with pytest.raises(InputError, match="x must be"):
         model(torch.zeros(2, 6), model.pyramid(torch.zeros(1, 3, dtype=torch.int64), cu_rows))
+    with pytest.raises(InputError, match="in_channels must be at least 1; got 0"):
+        config(in_channels=0)
     with pytest.raises(InputError, match="mirror must be one of"):
         config(mirror="both")
 
