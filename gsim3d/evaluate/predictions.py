@@ -115,7 +115,7 @@ def _find(path: Path, steps: range) -> Path | list[Path]:
     if path.is_dir():
         return _frames(path, steps)
     for video in path.parent.glob(f"{path.name}.*"):
-        if video.suffix.lower() in VIDEO_SUFFIXES:
+        if video.suffix.lower() in VIDEO_SUFFIXES and video.is_file():
             return video
     raise InputError(f"{path} is missing: a folder of frames, or a video {path.name}{VIDEO_SUFFIXES[0]}")
 
