@@ -79,7 +79,7 @@ def takes_of(folder: Path) -> dict[Path, list[Path]]:
 
 def films_in(folder: Path) -> list[Path]:
     """Returns the film files in ``folder``, in natural order."""
-    files = folder.iterdir() if folder.is_dir() else ()
+    files = filter(Path.is_file, folder.iterdir()) if folder.is_dir() else ()
     films = [file for file in files if file.suffix.lower() in VIDEO_SUFFIXES and file.name[0] != "."]
     return sorted(films, key=lambda file: natural_order(file.name))
 

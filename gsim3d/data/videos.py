@@ -192,7 +192,8 @@ def _masks(folder: Path, description: Description, sources: list[_Frames | Video
 
 def _frames_of(folder: Path, name: str, size: tuple[int, int], source: Path, problems: Problems) -> _Frames | Video:
     """Finds the frames of a camera; they have no numbers on error."""
-    videos = [path for path in folder.iterdir() if path.stem == name and path.suffix.lower() in VIDEO_SUFFIXES]
+    named = (path for path in folder.iterdir() if path.stem == name and path.suffix.lower() in VIDEO_SUFFIXES)
+    videos = [path for path in named if path.is_file()]
     frames = _Frames(folder, Path(name), name, size)
     if len(videos) == 1 and not (folder / name).is_dir():
         return Video(inside(folder, videos[0].name, f"camera {name}"), name, size, problems)

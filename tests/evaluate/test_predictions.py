@@ -1,6 +1,7 @@
 """Predictions of other models: found by scene, camera and step; what is missing, short or odd is named."""
 
 import json
+import os
 import shutil
 
 import cv2
@@ -151,6 +152,11 @@ def broken_video(place):
     (place / "cam_1.mp4").write_bytes(b"no video")
 
 
+def pipe_as_video(place):
+    remove_camera(place)
+    os.mkfifo(place / "cam_1.mp4")
+
+
 def uneven_video(place):
     remove_camera(place)
     with_gaps(write_plain(place / "cam_1.mp4", 4, size=(32, 32)), [40, 400, 40])
@@ -219,6 +225,7 @@ def test_sixteen_bits_and_alpha_are_read_like_recordings(data, folder):
         (short_video, r"cam_1.mp4 has 3 frames; .* must have 6 .* or without the input steps 4"),
         (long_video, r"cam_1.mp4 has more than 6 frames"),
         (large_video, r"cam_1.mp4 .*has 34x32 pixels, its camera 32x32"),
+        (pipe_as_video, r"cam_1 is missing: a folder of frames, or a video cam_1.mp4"),
         (uneven_video, r"cam_1.mp4: its 4 frames are 40 to 400 ms apart"),
         (cut_video, r"cam_1.mp4 .*cannot be (opened|decoded)"),
         (float_tiff, r"frame4.tif .*must have 8 or 16 bits per channel; got float32"),
