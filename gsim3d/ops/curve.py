@@ -237,8 +237,10 @@ class PatchTable:
     """Patch p has queries q_rows[cu_q[p]:cu_q[p + 1]] and keys kv_rows[cu_k[p]:cu_k[p + 1]].
 
     Attributes:
-        q_rows, kv_rows: int64 [N] and [M]; for :func:`patch_attention` also int32.
-        cu_q, cu_k: the same, [P + 1].
+        q_rows: int64 [N]; for :func:`patch_attention` all four may be int32.
+        kv_rows: int64 [M].
+        cu_q: int64 [P + 1].
+        cu_k: int64 [P + 1].
     """
 
     q_rows: Tensor
