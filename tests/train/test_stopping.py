@@ -30,6 +30,16 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP)
 
 
+@pytest.fixture(autouse=True)
+def heard():
+    """No signal is ignored, as those of a terminal are in jobs of a shell's background; children inherit that."""
+    handlers = [signal.default_int_handler, *[signal.SIG_DFL] * 3]
+    before = {number: signal.signal(number, handler) for number, handler in zip(SIGNALS, handlers, strict=True)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     return write_scenes(tmp_path_factory.mktemp("scenes"), 2)
