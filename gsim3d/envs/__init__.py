@@ -20,15 +20,18 @@ from gsim3d.envs import cloth, push
 from gsim3d.envs.cloth import ClothCover
 from gsim3d.envs.hybrid import HybridScene
 from gsim3d.envs.push import PushClear, PushToGoal
+from gsim3d.envs.tasks import TaskVectorEnv
 from gsim3d.envs.throw import ThrowToTarget
 
 __all__ = ["ClothCover", "HybridScene", "PushClear", "PushToGoal", "ThrowToTarget"]
 
 _MAX_STEPS = {PushToGoal: push.MAX_STEPS, PushClear: push.MAX_STEPS, ThrowToTarget: None, ClothCover: cloth.MAX_STEPS}
 for _env, _max_steps in _MAX_STEPS.items():
+    _vector = f"{_env.__name__}Vector"  # names in a spec are of the form module:class
+    globals()[_vector] = type(_vector, (TaskVectorEnv,), {"task": _env, "__module__": __name__})
     gymnasium.register(
         f"gsim3d/{_env.__name__}-v0",
-        entry_point=f"{_env.__module__}:{_env.__name__}",
-        vector_entry_point=f"{_env.__module__}:{_env.__name__}Vector",
+        entry_point=f"{__name__}:{_env.__name__}",
+        vector_entry_point=f"{__name__}:{_vector}",
         max_episode_steps=_max_steps,
     )

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.envs.scenes import FPS, N_PARTICLES, Scenes, TrueScene
-from gsim3d.envs.tasks import TaskEnv, TaskVectorEnv
+from gsim3d.envs.tasks import TaskEnv
 from gsim3d.synth.embedding import ClothGrid, grid_faces
 from gsim3d.synth.mujoco_engine import CLOTH_RADIUS, CONTACT_TIME, POISSON, check_solver, load_mujoco
 from gsim3d.synth.pushing import balls
@@ -161,12 +161,6 @@ class ClothCover(TaskEnv):
     @classmethod
     def solved(cls, distances: Tensor) -> Tensor:
         return distances < 1 - COVERED
-
-
-class ClothCoverVector(TaskVectorEnv):
-    """:class:`ClothCover` side by side."""
-
-    task = ClothCover
 
 
 def _disc() -> np.ndarray:

@@ -14,9 +14,10 @@ from gsim3d.effects.edits import Rotate
 from gsim3d.effects.plan import Plan
 from gsim3d.effects.selection import Selection
 from gsim3d.envs.model import ActorRows
-from gsim3d.errors import InputError, NumericalError
+from gsim3d.errors import InputError
 from gsim3d.simulator import Simulator
-from gsim3d.state import Particles, append_step, last_steps, newest_clouds
+from gsim3d.state import DYNAMIC, Particles, append_step, last_steps, newest_clouds
+from gsim3d.synth.mujoco_engine import check_solver, load_mujoco
 
 if TYPE_CHECKING:
     import mujoco
@@ -42,8 +43,8 @@ class HybridScene:
         data: state of MuJoCo.
 
     Raises:
-        InputError: ``state`` has several scenes, a body does not exist or has no particles, two bodies share some, or
-            ``1 / fps`` is not a multiple of MuJoCo's time step.
+        InputError: ``state`` has several scenes, a body does not exist or has no moving particles, two bodies share
+            some, ``1 / fps`` is not a multiple of MuJoCo's time step, or ``data`` is of another model.
     """
 
     def __init__(
@@ -57,8 +58,10 @@ class HybridScene:
         fps: float,
         plan: Plan | None = None,
     ):
-        self._substeps = max(1, round(1 / (fps * model.opt.timestep)))
-        if abs(self._substeps * model.opt.timestep * fps - 1) > 1e-6:
+        if data.signature != model.signature:
+            raise InputError("data is of another MuJoCo model")
+        self._substeps = max(1, round(1 / (fps * model.opt.timestep))) if 0 < fps < np.inf else 0
+        if not abs(self._substeps * model.opt.timestep * fps - 1) <= 1e-6:  # also of NaN
             raise InputError(f"1 / fps must be a multiple of the time step {model.opt.timestep:g} s; got fps {fps:g}")
         if len(newest_clouds(state.clouds)) != 1:
             raise InputError("state must have one scene")
@@ -68,9 +71,12 @@ class HybridScene:
             if name not in known:
                 raise InputError(f"bodies: MuJoCo's model has no body {name!r}; it has {', '.join(known)}")
             chosen = selection.mask(state)
+            if bool((state.activity[chosen] != DYNAMIC).any()):
+                raise InputError(f"bodies: particles of {name} are frozen; select moving ones")
             if bool((actor[chosen] >= 0).any()):
                 raise InputError(f"bodies: {name} shares particles with another body")
             actor = torch.where(chosen, number, actor)
+        load_mujoco().mj_kinematics(model, data)  # where bodies are, also in data that no step has computed
         self.simulator, self.model, self.data, self.plan = simulator, model, data, plan or simulator.plan()
         self.state, self._bodies = dataclasses.replace(state, actor=actor), [known.index(name) for name in bodies]
 
@@ -79,33 +85,28 @@ class HybridScene:
         """Advances MuJoCo and the particles by one step. Returns the new particles.
 
         Raises:
-            NumericalError: MuJoCo's state is not finite.
+            Unstable: MuJoCo warns of its state, which it then resets; lower its time step.
         """
-        import mujoco
-
-        before, turned = (x[self._bodies].copy() for x in (self.data.xpos, self.data.xmat))
+        mujoco = load_mujoco()
+        for warning in self.data.warning:
+            warning.number = 0
+        before, turned = (x[self._bodies].copy() for x in (self.data.xpos, self.data.xquat))
         mujoco.mj_step(self.model, self.data, self._substeps)
         mujoco.mj_kinematics(self.model, self.data)
-        if not np.isfinite(self.data.qpos).all():
-            raise NumericalError("the positions of MuJoCo's model are not finite; lower its time step")
-        after, matrices = self.data.xpos[self._bodies], self.data.xmat[self._bodies]
+        check_solver(self.data)
+        after, turns = self.data.xpos[self._bodies], self.data.xquat[self._bodies]
         moved = torch.from_numpy(after - before)
         actors = [Actor(one[None], ActorRows(number=number)) for number, one in enumerate(moved)]
         step = self.simulator.rollout(self.state, 1, self.plan, actors=actors)[0]
-        for number, (old, new) in enumerate(zip(turned, matrices, strict=True)):
-            axis, angle = _rotation(new.reshape(3, 3) @ old.reshape(3, 3).T)
-            turn = Rotate(ActorRows(number=number), tuple(axis), np.degrees(angle), tuple(after[number]))
+        for number, (old, new) in enumerate(zip(turned, turns, strict=True)):
+            local, turn = np.zeros(3), np.zeros(3)  # rotation vectors, in the body's frame before and in the world
+            mujoco.mju_subQuat(local, new, old)
+            mujoco.mju_rotVecQuat(turn, local, old)
+            axis, angle = tuple(turn) if turn.any() else (0.0, 0.0, 1.0), np.degrees(np.linalg.norm(turn))
+            turn = Rotate(ActorRows(number=number), axis, angle, tuple(after[number]))
             step = turn.apply(step, self.simulator.renderer)
         if step.velocity is not None:
             driven, newest = (step.actor >= 0)[:, None], last_steps(self.state, 1)
             step = dataclasses.replace(step, velocity=torch.where(driven, step.means - newest.means, step.velocity))
         self.state = append_step(self.state, step, self.plan.history)
         return step
-
-
-def _rotation(matrix: np.ndarray) -> tuple[np.ndarray, float]:
-    """Axis [3] and angle in rad, below pi, of a rotation."""
-    twice = np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
-    sine = np.linalg.norm(twice) / 2
-    axis = twice / (2 * sine) if sine > 1e-12 else np.array([0.0, 0.0, 1.0])
-    return axis, float(np.arctan2(sine, (np.trace(matrix) - 1) / 2))

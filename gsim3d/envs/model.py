@@ -139,8 +139,7 @@ class ModelScenes(Scenes):
         for (number, start), of_scene in zip(started.items(), labels, strict=True):
             self._choose(number, start, of_scene, rngs[number])
 
-    @torch.no_grad()
-    def move(self, velocities: Tensor) -> None:
+    def move(self, velocities: Tensor) -> None:  # gradients flow to velocities
         before, actors = self.state.particles, self.state.actors
         moved = velocities / FPS
         path = torch.cat([actors, actors[:, -1:] + moved[:, None]], 1)
@@ -234,10 +233,13 @@ class ModelScenes(Scenes):
 
     @torch.no_grad()
     def images(self, rig: cameras.Rig) -> Tensor:
+        return (255 * self.colors(rig).clamp(0, 1) + 0.5).to(torch.uint8)
+
+    def colors(self, rig: cameras.Rig) -> Tensor:
+        """Images of the cameras of ``rig``, float [n, V, H, W, 3]; differentiable. Copies lack a shared background."""
         newest, shown = last_steps(self.state.particles, 1), torch.arange(self.count, device=self.device)
         views = _cameras(rig, shown.repeat_interleave(rig.n_cams))
-        color = self.simulator.render(newest, views, plan=self.plan).color
-        return (255 * color.clamp(0, 1) + 0.5).to(torch.uint8).unflatten(0, (self.count, rig.n_cams))
+        return self.simulator.render(newest, views, plan=self.plan).color.unflatten(0, (self.count, rig.n_cams))
 
     def _frames(self, started: Mapping[int, Start]) -> tuple[Frames, Tensor]:
         """Input frames, and the label of each pixel: a body, then an actor, else negative."""

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.envs.scenes import FPS, N_PARTICLES, Scenes, TrueScene, polar
-from gsim3d.envs.tasks import TaskEnv, TaskVectorEnv
+from gsim3d.envs.tasks import TaskEnv
 from gsim3d.synth import pushing
 from gsim3d.synth.embedding import RigidFrame
 from gsim3d.synth.scene_setup import Pusher
@@ -142,18 +142,6 @@ class PushClear(_Push):
     @classmethod
     def solved(cls, distances: Tensor) -> Tensor:
         return distances == 0
-
-
-class PushToGoalVector(TaskVectorEnv):
-    """:class:`PushToGoal` side by side."""
-
-    task = PushToGoal
-
-
-class PushClearVector(TaskVectorEnv):
-    """:class:`PushClear` side by side."""
-
-    task = PushClear
 
 
 def bounded_velocity(pusher: Tensor, velocity: Tensor) -> Tensor:

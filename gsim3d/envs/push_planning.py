@@ -8,7 +8,8 @@ from torch import Tensor
 
 from gsim3d.envs.model import ModelScenes, ModelState
 from gsim3d.envs.push import MAX_SPEED, PushToGoal, bounded_velocity
-from gsim3d.synth.pushing import PUSHER_RADIUS, SIZE, PushSimulation, PushState
+from gsim3d.synth.cameras import Rig
+from gsim3d.synth.pushing import PUSHER_RADIUS, SIZE, PushSimulation
 from gsim3d.synth.scene_setup import Unstable
 
 BEHIND = SIZE / 2 + PUSHER_RADIUS  # metres behind the body, seen from the goal, where the pusher should be
@@ -22,6 +23,8 @@ class PushStates:
 
     centers: Tensor  #: [K, H, 2] of the body
     pusher: Tensor  #: [K, H, 2]
+    points: Tensor | None = None  #: [K, H, 256, 3] of the body; None in MuJoCo
+    images: Tensor | None = None  #: [K, V, h, w, 3] after the last step, RGB in [0, 1]; None without cameras
 
 
 class TrueDynamics:
@@ -34,11 +37,11 @@ class TrueDynamics:
     def __init__(self, simulation: PushSimulation):
         self.simulation = simulation
 
-    def __call__(self, state: PushState, actions: Tensor) -> PushStates:
+    def __call__(self, state: np.ndarray, actions: Tensor) -> PushStates:
         """Positions after each of ``actions`` [K, H, 2], m/s, from ``state``."""
         simulation, shape = self.simulation, tuple(actions.shape)
         centers, pusher = np.full(shape, np.nan), np.full(shape, np.nan)
-        for k, sequence in enumerate(actions.double().cpu()):
+        for k, sequence in enumerate(actions.detach().double().cpu()):
             simulation.restore(state)
             try:
                 for step, action in enumerate(sequence):
@@ -52,25 +55,26 @@ class TrueDynamics:
 
 
 class ModelDynamics:
-    """Dynamics for planners: a learned simulator, all sequences in one batch.
+    """Dynamics for planners: a learned simulator, all sequences in one batch. Gradients flow to actions.
 
     Args:
         scenes: one scene; calls leave it as it is.
         reach: see :meth:`gsim3d.envs.model.ModelScenes.repeated`.
+        rig: cameras of the predicted images, for costs of images.
     """
 
-    def __init__(self, scenes: ModelScenes, reach: float | None = None):
-        self.scenes, self.reach = scenes, reach
+    def __init__(self, scenes: ModelScenes, reach: float | None = None, rig: Rig | None = None):
+        self.scenes, self.reach, self.rig = scenes, reach, rig
 
     def __call__(self, state: ModelState, actions: Tensor) -> PushStates:
         """Positions after each of ``actions`` [K, H, 2], m/s, from ``state``."""
         copies = self.scenes.repeated(state, len(actions), self.reach)
-        centers, pusher = [], []
+        steps = []
         for action in actions.to(copies.device, torch.float64).unbind(1):
             PushToGoal.act(copies, action)
-            centers.append(copies.centers()[:, 0, :2])
-            pusher.append(copies.actors()[:, 0, :2])
-        return PushStates(torch.stack(centers, 1), torch.stack(pusher, 1))
+            steps.append((copies.centers()[:, 0, :2], copies.actors()[:, 0, :2], copies.points()))
+        images = None if self.rig is None else copies.colors(self.rig)
+        return PushStates(*(torch.stack(of, 1) for of in zip(*steps, strict=True)), images)
 
 
 @dataclass(frozen=True)

@@ -130,18 +130,16 @@ class TrueScenes(Scenes):
         return torch.from_numpy(np.stack([scene.actors for scene in self.all]))
 
     def centers(self) -> Tensor:
-        return torch.from_numpy(np.stack([padded(scene.centers, self.most_bodies) for scene in self.all]))
+        found = torch.full((len(self.all), self.most_bodies, 3), torch.nan, dtype=torch.float64)
+        for scene, centers in zip(self.all, found, strict=True):
+            centers[: scene.n_bodies] = torch.from_numpy(scene.centers)
+        return found
 
     def points(self) -> Tensor:
         return torch.from_numpy(np.stack([scene.points() for scene in self.all]).astype(np.float32))
 
     def images(self, rig: cameras.Rig) -> Tensor:
         return torch.from_numpy(np.stack([scene.view(rig).rgb for scene in self.all]))
-
-
-def padded(centers: np.ndarray, count: int) -> np.ndarray:
-    """Centers [B, 3] with rows of NaN up to ``count``."""
-    return np.concatenate([centers, np.full((count - len(centers), 3), np.nan)])
 
 
 def polar(rng: np.random.Generator, distance: tuple[float, float]) -> np.ndarray:

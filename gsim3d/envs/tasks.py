@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping
+from numbers import Integral
 from typing import Any, ClassVar
 
 import gymnasium
@@ -16,7 +17,8 @@ from torch import Tensor
 from gsim3d import pretrained
 from gsim3d.envs.model import ModelScenes
 from gsim3d.envs.scenes import FPS, N_PARTICLES, N_VIEWS, Scenes, TrueScene, TrueScenes, task_rig
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, check_one_of
+from gsim3d.io.files import shown
 from gsim3d.simulator import Simulator
 
 OBSERVATIONS = ("particles", "images", "both")
@@ -81,21 +83,20 @@ class TaskEnv(gymnasium.Env):
         Raises:
             InputError: ``action`` is not inside the bounds, or no episode has begun.
         """
-        self._episodes.act(torch.as_tensor(np.array(action, np.float64))[None])
+        self._episodes.act(self._episodes.numbers(action)[None])
         info = self._info()
         return self._observe(), -float(self._episodes.distances[0]), bool(self._episodes.ended[0]), False, info
 
     def render(self) -> np.ndarray | None:
         """uint8 [H, W, 3] of the first camera; None without a render mode."""
-        return self.scenes.images(self.rig)[0, 0].cpu().numpy() if self.render_mode == "rgb_array" else None
+        return self._episodes.pictures()[0] if self.render_mode == "rgb_array" else None
 
     def _observe(self) -> dict[str, np.ndarray]:
         return {name: value[0].cpu().numpy() for name, value in self._episodes.observe().items()}
 
     def _info(self) -> dict[str, Any]:
         found = {name: value[0].cpu().numpy() for name, value in self._episodes.info().items()}
-        exists = np.isfinite(found["centers"][:, 0])
-        return {**found, "is_success": bool(found["is_success"]), "centers": found["centers"][exists]}
+        return {**found, "is_success": bool(found["is_success"])}
 
     @classmethod
     @abstractmethod
@@ -149,19 +150,17 @@ class Episodes:
         model: str | None = None,
         device: str = "cpu",
     ):
-        for name, value, known in (("observation", observation, OBSERVATIONS), ("backend", backend, BACKENDS)):
-            if value not in known:
-                raise InputError(f"{name} must be one of {', '.join(known)}; got {value!r}")
-        if render_mode not in (None, *RENDER_MODES):
-            raise InputError(f"render_mode must be rgb_array or None; got {render_mode!r}")
-        if image_size < 1:
-            raise InputError(f"image_size must be at least 1; got {image_size}")
+        check_one_of("observation", observation, OBSERVATIONS)
+        check_one_of("backend", backend, BACKENDS)
+        check_one_of("render_mode", render_mode or RENDER_MODES[0], RENDER_MODES)
+        if not isinstance(image_size, Integral) or image_size < 1:
+            raise InputError(f"image_size must be a whole number of at least 1; got {image_size!r}")
         self.task, self.count, self.observation, self.rig = task, count, observation, task_rig(image_size)
         self.scenes: Scenes
         if backend == "model":
             if model is None and task.shipped not in pretrained.names():
                 raise InputError('backend="model" needs model=PATH, a checkpoint of a trained simulator')
-            simulator = Simulator.from_pretrained(model or task.shipped, device=device)
+            simulator = Simulator.from_pretrained(model or task.shipped, device=device).requires_grad_(False)
             self.scenes = ModelScenes(simulator, count, task.max_bodies, image_size)
         elif model is not None or device != "cpu":
             raise InputError('model and device are of backend="model"; MuJoCo simulates the truth on the CPU')
@@ -195,6 +194,14 @@ class Episodes:
         self.executed[list(drawn)] = 0
         self._measure()
 
+    def numbers(self, actions: Any) -> Tensor:
+        """``actions`` of any kind as float64. Raises InputError if they are no numbers."""
+        try:
+            return torch.as_tensor(actions, dtype=torch.float64, device=self.scenes.device)
+        except (TypeError, ValueError, RuntimeError):
+            raise InputError(f"action must be {len(self._high)} numbers; got {shown(actions)}") from None
+
+    @torch.no_grad()
     def act(self, actions: Tensor) -> None:
         """Simulates a step with ``actions`` [n, A].
 
@@ -203,7 +210,6 @@ class Episodes:
         """
         if self.executed is None:
             raise InputError("step was called before reset")
-        actions = actions.to(self._high)
         shape = (self.count, len(self._high))
         if actions.shape != shape or not bool((actions.abs() <= self._high + 1e-6).all()):
             bounds = ", ".join(f"{high:g}" for high in self.task.max_action)
@@ -216,6 +222,12 @@ class Episodes:
     def _measure(self) -> None:
         self.distances = self.task.distances(self.scenes, self.goals)
         self.solved, self.ended = self.task.solved(self.distances), self.task.ended(self.distances)
+
+    def pictures(self) -> np.ndarray:
+        """Images of the first camera, uint8 [n, H, W, 3]."""
+        if self.executed is None:
+            raise InputError("render was called before reset")
+        return self.scenes.images(self.rig)[:, 0].cpu().numpy()
 
     def observe(self) -> dict[str, Tensor]:
         """Observations [n, ...]."""
@@ -230,8 +242,9 @@ class Episodes:
         return found
 
     def info(self) -> dict[str, Tensor]:
-        """Facts [n, ...]."""
+        """Facts [n, ...]; the centers of bodies that a scene does not have are infinite: NaN would not equal itself."""
         centers = self.scenes.centers()[..., :2]
+        centers = torch.where(centers.isnan(), torch.inf, centers)
         return {"is_success": self.solved, "centers": centers, "velocity": self.executed.clone()}
 
 
@@ -260,8 +273,11 @@ class TaskVectorEnv(VectorEnv):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **options,
     ):
-        if num_envs < 1:
-            raise InputError(f"num_envs must be at least 1; got {num_envs}")
+        for name, value in (("num_envs", num_envs), ("max_episode_steps", max_episode_steps)):
+            if value is not None and (not isinstance(value, Integral) or value < 1):
+                raise InputError(f"{name} must be a whole number of at least 1; got {value!r}")
+        autoreset_mode = getattr(autoreset_mode, "value", autoreset_mode)
+        check_one_of("autoreset_mode", autoreset_mode, [mode.value for mode in AutoresetMode])
         self._episodes = Episodes(self.task, num_envs, **options)
         self.mode, self.num_envs = AutoresetMode(autoreset_mode), num_envs
         self._torch = not isinstance(self._episodes.scenes, TrueScenes)
@@ -289,8 +305,9 @@ class TaskVectorEnv(VectorEnv):
         Raises:
             InputError: seeds or mask have a wrong length, or the first reset is not of all environments.
         """
-        if seed is None or isinstance(seed, (int, np.integer)):
-            seed = [None if seed is None else int(seed) + i for i in range(self.num_envs)]
+        seed = np.asarray(seed).tolist()  # of an array, too, Python's integers
+        if not isinstance(seed, list):
+            seed = [seed if seed is None else seed + i for i in range(self.num_envs)]
         chosen = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, bool)))
         if len(seed) != self.num_envs or chosen.shape != (self.num_envs,) or chosen.dtype != bool:
             raise InputError(f"seed and reset_mask must be of {self.num_envs} environments")
@@ -314,9 +331,8 @@ class TaskVectorEnv(VectorEnv):
         episodes, over = self._episodes, self._over
         if self.mode is AutoresetMode.DISABLED and over.any():
             raise InputError(f"environments {over.nonzero()[0].tolist()} have ended; reset them with reset_mask")
-        actions = torch.as_tensor(actions, device=self.scenes.device)
         if not over.all():
-            episodes.act(actions)
+            episodes.act(episodes.numbers(actions))
         self._begin(over)
         self._steps += ~over
         begun = torch.from_numpy(over).to(self.scenes.device)
@@ -336,9 +352,7 @@ class TaskVectorEnv(VectorEnv):
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """uint8 [H, W, 3] of the first camera of each environment; None without a render mode."""
-        if self.render_mode is None:
-            return None
-        return tuple(self.scenes.images(self._episodes.rig)[:, 0].cpu().numpy())
+        return None if self.render_mode is None else tuple(self._episodes.pictures())
 
     def _generator(self, number: int) -> np.random.Generator:
         if number not in self._rngs:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from gsim3d.envs.model import ModelScenes
 from gsim3d.envs.scenes import FPS, N_PARTICLES, Scenes, TrueScene, TrueScenes, polar
-from gsim3d.envs.tasks import TaskEnv, TaskVectorEnv
+from gsim3d.envs.tasks import TaskEnv
 from gsim3d.synth import pushing
 from gsim3d.synth.embedding import RigidFrame
 from gsim3d.synth.mujoco_engine import simulate
@@ -103,7 +103,7 @@ class ThrowToTarget(TaskEnv):
         scenes.throw(actions)
         for _ in range(FRAMES):
             scenes.move(scenes.actors())
-        return actions
+        return actions.clone()
 
     @classmethod
     def distances(cls, scenes: Scenes, goals: Tensor) -> Tensor:
@@ -116,9 +116,3 @@ class ThrowToTarget(TaskEnv):
     @classmethod
     def ended(cls, distances: Tensor) -> Tensor:
         return torch.ones_like(distances, dtype=torch.bool)
-
-
-class ThrowToTargetVector(TaskVectorEnv):
-    """:class:`ThrowToTarget` side by side."""
-
-    task = ThrowToTarget

@@ -1,4 +1,4 @@
-"""Costs of predicted particles, for planners: each returns one value a sequence, and is differentiable.
+"""Costs of predicted particles and images, for planners: each returns one value a sequence, and is differentiable.
 
 Positions are metres. Sequences share the number of particles: [K, T, N, 3].
 """
@@ -39,6 +39,11 @@ def chamfer(positions: Tensor, target: Tensor) -> Tensor:
     """
     distances = torch.cdist(positions[:, -1], target.expand(len(positions), -1, -1))
     return distances.amin(2).mean(1) + distances.amin(1).mean(1)
+
+
+def image_distance(images: Tensor, target: Tensor) -> Tensor:
+    """Mean squared difference of images [K, ...] to ``target`` [...] of the same cameras, [K]."""
+    return (images - target).square().flatten(1).mean(1)
 
 
 def smoothness(actions: Tensor) -> Tensor:

@@ -19,8 +19,10 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -47,7 +49,7 @@ class Planner(ABC):
     Args:
         dynamics: see the module.
         cost: see the module.
-        low, high: bounds of an action [A], finite.
+        low, high: bounds of an action [A], finite; tensors or arrays, as those of an action space.
         horizon: actions in a sequence, H.
         samples: sequences in each iteration, K.
         iterations: number of iterations in each call.
@@ -65,8 +67,8 @@ class Planner(ABC):
         self,
         dynamics: Callable[[Any, Tensor], Any],
         cost: Callable[[Any, Tensor], Tensor],
-        low: Tensor,
-        high: Tensor,
+        low: Tensor | np.ndarray,
+        high: Tensor | np.ndarray,
         *,
         horizon: int = 10,
         samples: int = 64,
@@ -76,13 +78,14 @@ class Planner(ABC):
         chunk: int | None = None,
         seed: int = 0,
     ):
-        for name, value in (("horizon", horizon), ("samples", samples), ("iterations", iterations)):
-            if value < 1:
-                raise InputError(f"{name} must be at least 1; got {value}")
-        if chunk is not None and chunk < 1:
-            raise InputError(f"chunk must be at least 1; got {chunk}")
-        if low.shape != high.shape or low.dim() != 1 or low.device != high.device or low.dtype != high.dtype:
-            raise InputError("low and high must be vectors [A] of one length, dtype and device")
+        counts = {"horizon": horizon, "samples": samples, "iterations": iterations}
+        for name, value in {**counts, "chunk": samples if chunk is None else chunk}.items():
+            if not isinstance(value, Integral) or value < 1:
+                raise InputError(f"{name} must be a whole number of at least 1; got {value!r}")
+        low, high = torch.as_tensor(low), torch.as_tensor(high)
+        same = low.shape == high.shape and low.device == high.device and low.dtype == high.dtype
+        if not same or low.dim() != 1 or not low.is_floating_point():
+            raise InputError("low and high must be vectors [A] of one length, floating dtype and device")
         if not low.isfinite().all() or not high.isfinite().all() or not (low < high).all():
             raise InputError("low and high must be finite, with low below high in every element")
         if not (noise > 0 and math.isfinite(noise)) or not (color >= 0 and math.isfinite(color)):
@@ -108,8 +111,8 @@ class Planner(ABC):
         Raises:
             NumericalError: no sequence has a finite cost.
         """
-        if executed < 0:
-            raise InputError(f"executed must be 0 or more; got {executed}")
+        if not isinstance(executed, Integral) or executed < 0:
+            raise InputError(f"executed must be a whole number of 0 or more; got {executed!r}")
         best = _Best(_shifted(self._last, executed))
         with torch.no_grad():
             self._search(state, best, executed)
@@ -129,8 +132,9 @@ class Planner(ABC):
 
     def _evaluate(self, state: Any, actions: Tensor) -> Tensor:
         costs = self.cost(self.dynamics(state, actions), actions)
-        if costs.shape != (len(actions),):
-            raise InputError(f"cost must return one value a sequence [{len(actions)}]; got {list(costs.shape)}")
+        if not isinstance(costs, Tensor) or costs.shape != (len(actions),):
+            got = list(costs.shape) if isinstance(costs, Tensor) else type(costs).__name__
+            raise InputError(f"cost must return a tensor with one value a sequence [{len(actions)}]; got {got}")
         return costs
 
     def _sample(self, mean: Tensor, std: Tensor) -> Tensor:
@@ -172,8 +176,9 @@ class MPPI(Planner):
             sequences = self._sample(mean, std / (iteration + 1))
             costs = self._costs(state, sequences)
             best.update(sequences, costs)
-            weights = softmin(costs, self.temperature, max(1.0, self.effective_share * self.samples))
-            mean = torch.einsum("k,kha->ha", weights.to(mean), sequences)
+            if costs.isfinite().any():
+                weights = softmin(costs, self.temperature, max(1.0, self.effective_share * self.samples))
+                mean = torch.einsum("k,kha->ha", weights.to(mean), sequences)
             best.end_iteration()
         best.update(mean[None], self._costs(state, mean[None]))
         best.history[-1] = best.cost
@@ -219,7 +224,8 @@ class CEM(Planner):
             sequences = torch.cat([self._sample(mean, std), kept])
             costs = self._costs(state, sequences)
             best.update(sequences, costs)
-            elites = sequences[costs.argsort(stable=True)[:count].to(sequences.device)]
+            order = costs.argsort(stable=True)[: min(count, max(1, int(costs.isfinite().sum())))]
+            elites = sequences[order.to(sequences.device)]
             kept = elites[: round(self.kept_share * count)]
             mean = self.momentum * mean + (1 - self.momentum) * elites.mean(0)
             std = self.momentum * std + (1 - self.momentum) * elites.std(0, correction=0)
@@ -251,9 +257,12 @@ class GradientDescent(Planner):
         for _ in range(self.iterations):
             with torch.enable_grad():
                 value = self._evaluate(state, (scaled * scale)[None])
-                optimizer.zero_grad()
-                value.sum().backward()
-            if scaled.grad is None or not scaled.grad.isfinite().all():
+                # Of the actions alone, not of weights.
+                sought = torch.autograd.grad(value.sum(), scaled, allow_unused=True) if value.requires_grad else [None]
+            if sought[0] is None:
+                raise InputError("dynamics and cost must be differentiable; use MPPI or CEM where they are not")
+            scaled.grad = sought[0]
+            if not scaled.grad.isfinite().all():
                 break  # the best sequence so far stands
             optimizer.step()
             scaled.copy_(self._bounded(scaled * scale) / scale)

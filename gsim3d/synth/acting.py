@@ -117,10 +117,10 @@ class Push(World):
             if (np.linalg.norm(centers - start, axis=1) > CLEAR).all():
                 break
         if scripted:
-            legs = [(body, goal), *((int(rng.integers(len(centers))), _place(rng)) for _ in range(2))]
+            legs = [(body, goal), *((int(rng.integers(len(centers))), place(rng)) for _ in range(2))]
         else:  # near bodies, so that it meets them
-            near = [centers[rng.integers(len(centers))] + 0.5 * _place(rng) for _ in range(N_LEGS)]
-            legs = [(-1, place * min(1.0, ARENA / np.linalg.norm(place))) for place in near]
+            near = [centers[rng.integers(len(centers))] + 0.5 * place(rng) for _ in range(N_LEGS)]
+            legs = [(-1, at * min(1.0, ARENA / np.linalg.norm(at))) for at in near]
         surfaces = [*drawn.surfaces, pushing.pusher_surface()[0]]
         return dataclasses.replace(drawn, surfaces=surfaces, policy=PushPolicy(start, speed, tuple(legs)))
 
@@ -155,10 +155,10 @@ def _draw_push(centers: np.ndarray, rng: np.random.Generator) -> tuple[int, np.n
     return body, goal, centers[body] - rng.uniform(*START_DISTANCE) * np.array([np.cos(turn), np.sin(turn)])
 
 
-def _place(rng: np.random.Generator) -> np.ndarray:
-    """Draws a place [2] inside the arena."""
+def place(rng: np.random.Generator, reach: float = ARENA) -> np.ndarray:
+    """Draws a place [2] nearer than ``reach`` to the middle."""
     angle = rng.uniform(0, 2 * np.pi)
-    return ARENA * np.sqrt(rng.random()) * np.array([np.cos(angle), np.sin(angle)])
+    return reach * np.sqrt(rng.random()) * np.array([np.cos(angle), np.sin(angle)])
 
 
 def _center(body: SceneBody) -> np.ndarray:

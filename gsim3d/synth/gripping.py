@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsim3d.synth import mujoco_engine, pushing, scene_setup
-from gsim3d.synth.acting import RESTING, smooth_path
+from gsim3d.synth.acting import RESTING, place, smooth_path
 from gsim3d.synth.embedding import ClothGrid, ParticleCloud
 from gsim3d.synth.scene_setup import Cloth, SceneSetup, Unstable
 from gsim3d.synth.shapes import icosphere
@@ -67,13 +67,13 @@ class ClothGrip(World):
         """Draws the positions of the grippers [SETTLE fps + T, G, 3]; the first ones are those of their nodes."""
         grips = cloth.rest_nodes().reshape(-1, 3)[list(cloth.held)]
         middle, length = grips.mean(0), self.n_frames / self.fps * rng.uniform(*self.grip_speed)
-        begin = np.array([*_place(rng), cloth.height, rng.uniform(-np.pi, np.pi), 1.0])
+        begin = np.array([*place(rng, REACH), cloth.height, rng.uniform(-np.pi, np.pi), 1.0])
         poses, travelled, laid = [begin], 0.0, rng.random() < SCRIPTED  # middle, rotation, relative distance
         while travelled < length:
-            place = np.array([*_place(rng), LAID if laid else rng.uniform(*HEIGHTS)])
-            travelled += np.linalg.norm(place - poses[-1][:3])
+            at = np.array([*place(rng, REACH), LAID if laid else rng.uniform(*HEIGHTS)])
+            travelled += np.linalg.norm(at - poses[-1][:3])
             turn = poses[-1][3] + rng.uniform(-TURN, TURN) * (not laid)
-            poses.append(np.array([*place, turn, 1.0 if laid else rng.uniform(CLOSEST, 1.0)]))
+            poses.append(np.array([*at, turn, 1.0 if laid else rng.uniform(CLOSEST, 1.0)]))
         path = smooth_path(np.stack(poses), np.linspace(0, 1, self.n_frames) * length / travelled)
         before = smooth_path(np.stack([[*middle, 0.0, 1.0], begin]), np.linspace(0, 1.3, self._n_before))
         path = np.concatenate([before, path])
@@ -99,9 +99,3 @@ class ClothGrip(World):
         if (np.linalg.norm(np.diff(moved[0], axis=0), axis=2) * self.fps > FASTEST).any():
             raise Unstable("the cloth was torn away")
         self._check_view(rig, drawn.ground, moved)
-
-
-def _place(rng: np.random.Generator) -> np.ndarray:
-    """Draws a horizontal position [2] of the middle between the grippers."""
-    angle, away = rng.uniform(0, 2 * np.pi), REACH * np.sqrt(rng.random())
-    return away * np.array([np.cos(angle), np.sin(angle)])

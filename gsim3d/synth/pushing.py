@@ -1,7 +1,6 @@
 """Simulation of rigid bodies on a ground with a kinematic spherical pusher, by MuJoCo."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -56,13 +55,6 @@ def pusher_surface() -> tuple[render.Surface, np.ndarray]:
     return balls(1, PUSHER_COLOR, 2), PUSHER_RADIUS * icosphere(2)[0]
 
 
-@dataclass(frozen=True)
-class PushState:
-    """Full state of a :class:`PushSimulation`."""
-
-    values: np.ndarray  #: integration state of MuJoCo, float64
-
-
 class PushSimulation:
     """Simulation of bodies that a kinematic pusher moves over the ground, one frame a step.
 
@@ -81,8 +73,7 @@ class PushSimulation:
     def __init__(self, bodies: Sequence[RigidBody], pusher: Pusher, fps: float):
         if not 0 < fps < np.inf:
             raise InputError(f"fps must be positive; got {fps!r}")
-        mujoco = load_mujoco()
-        self._mujoco, self.fps, self.pusher_radius = mujoco, fps, pusher.radius
+        mujoco, self.fps = load_mujoco(), fps
         self._substeps = int(np.ceil(1 / (fps * SUBSTEP) - 1e-9))
         setup = SceneSetup(tuple(bodies), 0.0, pusher=pusher)
         self._model = mujoco.MjModel.from_xml_string(model_xml(setup, 1 / (fps * self._substeps)))
@@ -124,25 +115,25 @@ class PushSimulation:
         moved = np.array([*velocity, 0.0]) / self.fps
         self._advance(np.arange(1, self._substeps + 1)[:, None] / self._substeps * moved)
 
-    def state(self) -> PushState:
-        """Returns the current state, for :meth:`restore`."""
-        values = np.empty(self._mujoco.mj_stateSize(self._model, self._spec))
-        self._mujoco.mj_getState(self._model, self._data, values, self._spec)
-        return PushState(values)
+    def state(self) -> np.ndarray:
+        """Returns the full state, MuJoCo's integration state, for :meth:`restore`."""
+        values = np.empty(load_mujoco().mj_stateSize(self._model, self._spec))
+        load_mujoco().mj_getState(self._model, self._data, values, self._spec)
+        return values
 
-    def restore(self, state: PushState) -> None:
+    def restore(self, state: np.ndarray) -> None:
         """Restores a state of this simulation, also after it has failed."""
         for warning in self._data.warning:
             warning.number = 0
-        self._mujoco.mj_setState(self._model, self._data, state.values, self._spec)
-        self._mujoco.mj_forward(self._model, self._data)
+        load_mujoco().mj_setState(self._model, self._data, state, self._spec)
+        load_mujoco().mj_forward(self._model, self._data)
 
     def _advance(self, offsets: np.ndarray) -> None:
         """Simulates S substeps with the offsets [S, 3] of the pusher from its current position."""
-        start = self._data.mocap_pos[0].copy()
+        mujoco, start = load_mujoco(), self._data.mocap_pos[0].copy()
         for offset in offsets:
             self._data.mocap_pos[0] = start + offset
-            self._mujoco.mj_step(self._model, self._data)
-        self._mujoco.mj_kinematics(self._model, self._data)
-        self._mujoco.mj_comPos(self._model, self._data)
+            mujoco.mj_step(self._model, self._data)
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_comPos(self._model, self._data)
         check_solver(self._data)

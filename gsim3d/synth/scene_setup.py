@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsim3d.errors import NumericalError
+
 GRAVITY = 9.81  # m/s^2, along -z
 # Limits beyond which a simulation has failed.
 MAX_STRETCH = 2.0  # factor on the diagonal of a body's bounding box
@@ -92,7 +94,7 @@ def turn_about_z(angle: float) -> np.ndarray:
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
 
-class Unstable(Exception):
+class Unstable(NumericalError):
     """The simulation has failed: a body exploded, or passed through ground or cloth."""
 
 

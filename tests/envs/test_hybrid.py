@@ -1,13 +1,14 @@
 """Hybrid scenes: particles of MuJoCo's bodies move exactly as these, and others are predicted."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
 import torch
 
 from gsim3d.effects.selection import Selection
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, NumericalError
 from gsim3d.priors import InertiaConfig
 from gsim3d.state import DYNAMIC, last_steps
 from tests.test_simulator import CONFIG, awake, make_frames, make_simulator
@@ -79,10 +80,34 @@ def test_other_particles_see_the_bodies():
         ({"bodies": {"foot": Selection()}}, "no body 'foot'; it has world, arm, hand"),
         ({"bodies": {"arm": Selection(), "hand": ActorRows(number=1)}}, "hand shares particles"),
         ({"bodies": {"arm": Selection("moving", ((9, 9, 9), (9, 9, 9)))}}, "the selection is empty"),
+        ({"bodies": {"arm": Selection("frozen")}}, "particles of arm are frozen"),
         ({"fps": 15.0}, "multiple of the time step"),
+        ({"fps": 0.0}, "multiple of the time step 0.01 s; got fps 0"),
+        ({"fps": math.nan}, "got fps nan"),
         ({"frames": make_frames((2, 2))}, "one scene"),
     ],
 )
 def test_wrong_arguments_are_refused(options, words):
     with pytest.raises(InputError, match=words):
         make(**options)
+
+
+def test_data_that_no_step_has_computed_moves_no_particle_at_first():
+    scene = make()
+    fresh = HybridScene(
+        scene.simulator, scene.state, scene.model, mujoco.MjData(scene.model), {"arm": ActorRows(number=0)}, fps=10.0
+    )
+    before = last_steps(fresh.state, 1)
+    moved = (fresh.step().means - before.means)[before.actor == 0]
+    assert len(moved) and moved.abs().max() < 1e-6
+    other = mujoco.MjModel.from_xml_string("<mujoco><worldbody><body name='arm'/></worldbody></mujoco>")
+    with pytest.raises(InputError, match="of another MuJoCo model"):
+        HybridScene(scene.simulator, scene.state, scene.model, mujoco.MjData(other), {}, fps=10.0)
+
+
+@pytest.mark.parametrize("broken", [("qvel", 1e12), ("ctrl", math.nan)])
+def test_a_state_that_mujoco_resets_is_an_error(broken):
+    scene = make()
+    getattr(scene.data, broken[0])[0] = broken[1]
+    with pytest.raises(NumericalError):
+        scene.step()

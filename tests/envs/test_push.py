@@ -1,5 +1,6 @@
 """Push environments: Gymnasium's own checks, bits by seed, exact actors, and a planner that solves the task."""
 
+import copy
 import subprocess
 import sys
 import warnings
@@ -54,6 +55,15 @@ def test_an_episode_is_a_function_of_its_seed():
     assert not np.array_equal(episodes[0]["particles"], episodes[2]["particles"])
 
 
+def test_a_copy_of_an_episode_goes_on_by_itself():
+    task = PushToGoal()
+    task.reset(seed=3)
+    other = copy.deepcopy(task)
+    ends = [env.step(np.array([0.4, speed]))[0]["pusher"] for env, speed in ((task, 0.1), (other, 0.1), (other, -0.3))]
+    assert np.array_equal(ends[0], ends[1]) and not np.array_equal(ends[1], ends[2])
+    assert np.array_equal(task.simulation.pusher[:2].astype(np.float32), ends[0])
+
+
 def test_pusher_moves_exactly_as_commanded_and_moves_the_body():
     env = make()
     _, info = env.reset(seed=3)
@@ -72,7 +82,9 @@ def test_bodies_rest_while_the_pusher_is_away():
     before = info["centers"].copy()
     for _ in range(6):
         info = env.step(np.zeros(2, np.float32))[-1]
-    assert len(before) in (2, 3) and np.abs(info["centers"] - before).max() < 1e-3
+    exists = np.isfinite(before[:, 0])
+    assert exists.sum() in (2, 3) and before.shape == (3, 2) and np.isposinf(before[~exists]).all()
+    assert np.abs(info["centers"] - before)[exists].max() < 1e-3
 
 
 def test_particles_keep_their_distances_as_the_body_moves():
@@ -118,20 +130,57 @@ def test_a_cleared_region_is_solved():
     assert PushClear.solved(PushClear.distances(task.scenes, goals))
 
 
-@pytest.mark.parametrize("action", [np.zeros(3), np.array([np.nan, 0]), np.array([2 * MAX_SPEED, 0])])
+@pytest.mark.parametrize("action", [np.zeros(3), [np.nan, 0], np.array([2 * MAX_SPEED, 0]), "left", None, [[0], 0]])
 def test_wrong_actions_are_refused(action):
     task = PushToGoal()
-    with pytest.raises(InputError, match="before reset"):
+    with pytest.raises(InputError, match="step was called before reset"):
         task.step(np.zeros(2))
+    with pytest.raises(InputError, match="render was called before reset"):
+        PushToGoal(render_mode="rgb_array").render()
     task.reset(seed=0)
     with pytest.raises(InputError, match="action must be 2 numbers"):
         task.step(action)
 
 
-@pytest.mark.parametrize("options", [{"observation": "sound"}, {"render_mode": "human"}, {"image_size": 0}])
+@pytest.mark.parametrize("options", [{"observation": "sound"}, {"render_mode": "human"}, {"image_size": 2.5}])
 def test_wrong_options_are_refused(options):
     with pytest.raises(InputError, match=next(iter(options))):
         PushToGoal(**options)
+
+
+def test_vector_environments_of_gymnasium_take_scenes_with_different_numbers_of_bodies():
+    infos = []
+    for mode in ("sync", "vector_entry_point"):
+        envs = gymnasium.make_vec("gsim3d/PushClear-v0", num_envs=3, vectorization_mode=mode)
+        infos.append(envs.reset(seed=np.array([1, 2, 3]).tolist())[1])
+    assert np.array_equal(infos[0]["centers"], infos[1]["centers"])
+    assert np.isfinite(infos[0]["centers"]).all((1, 2)).tolist() != [True] * 3  # not all have three
+
+
+@pytest.mark.parametrize(
+    "options, words",
+    [
+        ({"num_envs": 0}, "num_envs must be a whole number of at least 1"),
+        ({"num_envs": 1.5}, "num_envs must be a whole number of at least 1"),
+        ({"max_episode_steps": 0}, "max_episode_steps must be a whole number of at least 1"),
+        ({"autoreset_mode": "Never"}, "autoreset_mode must be one of NextStep, SameStep, Disabled; got 'Never'"),
+    ],
+)
+def test_wrong_options_of_vector_environments_are_refused(options, words):
+    with pytest.raises(InputError, match=words):
+        gymnasium.make_vec("gsim3d/PushToGoal-v0", **{"num_envs": 2, **options})
+
+
+def test_seeds_may_be_an_array_and_actions_stay_as_they_are():
+    envs = gymnasium.make_vec("gsim3d/ThrowToTarget-v0", num_envs=2)
+    first = envs.reset(seed=np.array([3, 4]))[0]
+    assert np.array_equal(first["particles"], envs.reset(seed=3)[0]["particles"])
+    given = np.full((2, 3), 0.5)
+    for _ in range(3):
+        envs.step(given)
+    assert (given == 0.5).all()
+    with pytest.raises(InputError, match="action must be 3 numbers; got 'up'"):
+        envs.reset(seed=3), envs.step("up")
 
 
 def test_missing_gymnasium_is_one_clear_error():
@@ -151,7 +200,7 @@ def test_later_actions_change_no_earlier_state():
     assert torch.equal(states.centers[0, :3], states.centers[1, :3])
     assert torch.equal(states.pusher[0, :3], states.pusher[1, :3])
     assert not torch.equal(states.pusher[0, 3:], states.pusher[1, 3:])
-    assert np.array_equal(simulation.state().values, state.values)
+    assert np.array_equal(simulation.state(), state)
     for step, action in enumerate(actions[0].numpy()):
         simulation.step(action)
         assert np.array_equal(simulation.centers[0, :2], states.centers[0, step].numpy())

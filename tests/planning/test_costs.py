@@ -37,3 +37,5 @@ def test_costs_are_differentiable():
     for cost in (costs.mean_distance, costs.chamfer):
         assert torch.autograd.gradcheck(lambda p, cost=cost: cost(p, TARGET), given)
     assert torch.autograd.gradcheck(lambda p: costs.center_distance(p, TARGET[0]), given)
+    assert torch.autograd.gradcheck(lambda images: costs.image_distance(images, POSITIONS[0]), given)
+    assert costs.image_distance(POSITIONS + 0.5, POSITIONS[1])[1].item() == 0.25

@@ -107,9 +107,9 @@ def test_sequences_without_a_finite_cost_are_never_chosen(kind):
 @pytest.mark.parametrize(
     "options, words",
     [
-        ({"horizon": 0}, "horizon must be at least 1"),
-        ({"samples": 0}, "samples must be at least 1"),
-        ({"chunk": 0}, "chunk must be at least 1"),
+        ({"horizon": 0}, "horizon must be a whole number of at least 1"),
+        ({"samples": 2.5}, "samples must be a whole number of at least 1; got 2.5"),
+        ({"chunk": 0}, "chunk must be a whole number of at least 1"),
         ({"noise": -1.0}, "noise must be positive"),
         ({"temperature": 0.0}, "temperature must be positive"),
         ({"effective_share": 1.0}, "effective_share"),
@@ -123,8 +123,45 @@ def test_wrong_options_are_refused(options, words):
 def test_wrong_bounds_and_costs_are_refused():
     with pytest.raises(InputError, match="low below high"):
         MPPI(double_integrator, quadratic, HIGH, LOW)
-    with pytest.raises(InputError, match="one value a sequence"):
-        planner("mppi", cost=lambda states, actions: states).plan(START)
+    with pytest.raises(InputError, match="floating dtype"):
+        MPPI(double_integrator, quadratic, [-1], [1])
+    for wrong, got in ((lambda states, actions: states, r"\[64, 15, 2\]"), (lambda states, actions: 1.0, "float")):
+        with pytest.raises(InputError, match=f"one value a sequence .*got {got}"):
+            planner("mppi", cost=wrong).plan(START)
+    with pytest.raises(InputError, match="executed must be a whole number"):
+        planner("mppi").plan(START, 1.5)
+    for constant in (torch.ones(1), torch.ones(1, requires_grad=True)):
+        with pytest.raises(InputError, match="must be differentiable; use MPPI or CEM"):
+            planner("gradient", cost=lambda states, actions, one=constant: one.sum().expand(len(actions))).plan(START)
+
+
+def test_bounds_of_an_action_space_are_taken():
+    bounds = LOW.numpy(), HIGH.numpy()
+    assert torch.equal(
+        MPPI(double_integrator, quadratic, *bounds, horizon=5).plan(START).actions,
+        MPPI(double_integrator, quadratic, LOW, HIGH, horizon=5).plan(START).actions,
+    )
+
+
+@pytest.mark.parametrize("kind", ["mppi", "cem"])
+def test_only_sequences_of_finite_cost_move_the_mean(kind):
+    """Nothing but the sequence that plans begin with, zeros, has a cost; later not even that."""
+    calls = []
+
+    def cost(states, actions):
+        calls.append(actions)
+        alone = (actions == 0).flatten(1).all(1) & (len(calls) < 3)
+        return torch.where(alone, 1.0, math.nan)
+
+    plan = planner(kind, cost=cost, iterations=4).plan(START)
+    assert plan.cost == 1 and not plan.actions.any() and plan.history == (1.0,) * 4
+    assert all(not sequences[0].any() for sequences in calls)  # the mean
+
+
+def test_gradients_of_weights_stay_as_they_are():
+    weight = torch.ones((), dtype=torch.float64, requires_grad=True)
+    planner("gradient", dynamics=lambda state, actions: weight * double_integrator(state, actions)).plan(START)
+    assert weight.grad is None
 
 
 def test_softmin_reaches_the_effective_sample_size():
