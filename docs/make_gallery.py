@@ -81,7 +81,7 @@ def drawn(restored: Restored, scene: Scene, n_views: int, n_future: int, edit: E
     spec = dataclasses.replace(restored.plan.spec, structure=structure_of(given))
     restored = dataclasses.replace(restored, plan=restored.simulator.plan(spec))
     context, targets = default_views(restored, scene)
-    prediction = predict(restored, scene, context, n_future, 0, given)
+    prediction = predict(restored, scene, context, n_future, edits=given)
     cams = targets[:n_views]
     images = as_bytes(render_steps(restored, prediction.particles, scene, cams))
     return prediction, images, true_images(scene, cams, range(prediction.n_steps))

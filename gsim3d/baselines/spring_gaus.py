@@ -29,7 +29,7 @@ from gsim3d.baselines.spring_mass import (
 )
 from gsim3d.cameras import Cameras
 from gsim3d.data import Scene
-from gsim3d.data.recording import FIXED, MOVING, read_json
+from gsim3d.data.recording import FIXED, MOVING
 from gsim3d.errors import InputError
 from gsim3d.evaluate.metrics import ssim
 from gsim3d.io.terminal import progress
@@ -105,10 +105,10 @@ class SpringGaus:
             reason = f"{len(others)} cameras are left to fit"
         elif scene.has_actions():
             reason = "an actor moves the object"
-        elif _ground_height(scene) is None or not (scene.segmentation(others, [0]) == FIXED).any():
+        elif scene.ground_height is None or not (scene.segmentation(others, [0]) == FIXED).any():
             reason = "there is no ground"
         else:
-            facts, seen = _facts(scene), _count_bodies(_hull(scene, others, COARSE)[1])
+            facts, seen = scene.generated, _count_bodies(_hull(scene, others, COARSE)[1])
             n_bodies = max(seen, len(facts.get("bodies", [])) + ("cloth" in str(facts.get("world"))))
             if n_bodies != 1:
                 reason = f"{n_bodies} bodies (a cloth is one), and it simulates one"
@@ -123,6 +123,10 @@ class SpringGaus:
     def object_images(self, scene: Scene, cams: list[int], n_encoded: int, n_future: int) -> Tensor:
         """Returns the same images of the object alone, on black."""
         return _as_bytes(self._fit(scene, cams, n_encoded).images(cams, range(n_encoded, n_encoded + n_future)))
+
+    def points(self, scene: Scene, cams: list[int], n_encoded: int, n_future: int) -> Tensor:
+        """Returns the anchors [1 + n_future, N, 3] from the last of the first ``n_encoded`` steps on."""
+        return self._fit(scene, cams, n_encoded).anchors(range(n_encoded - 1, n_encoded + n_future)).cpu()
 
     def found(self) -> dict:
         """Returns what the last fit found, and in how many substeps a frame: friction acts in each."""
@@ -168,7 +172,7 @@ class Fit:
 
     def __init__(self, scene: Scene, cams: Sequence[int], count: int, config: SpringGausConfig, device: torch.device):
         self.scene, self.config, self.device, self._cams = scene, config, device, cams
-        self.height, self.substeps, self.losses = _ground_height(scene) or 0.0, config.substeps, []
+        self.height, self.substeps, self.losses = scene.ground_height or 0.0, config.substeps, []
         self._load(count)
         labels = scene.segmentation(cams, [0]).to(device)[0] != MOVING
         images = scene.images(cams, [0]).to(device)[0].permute(0, 2, 3, 1).float() / 255
@@ -296,13 +300,18 @@ class Fit:
         return SpringState(ended.positions, ended.velocities - self.velocity)
 
     @torch.no_grad()
-    def images(self, cams: Sequence[int], steps: range, beside: Splats | None = None) -> Tensor:
-        """Returns images [S, V, H, W, 3] in [0, 1] of the object at ``steps``, with others ``beside`` it."""
+    def anchors(self, steps: range) -> Tensor:
+        """Returns the positions [S, N, 3] of the anchors at ``steps``."""
         while len(self._rolled) < steps.stop:
             step, state = len(self._rolled), self._rolled[-1]
             self._rolled.append(self._advance(step, state, self.config.damping, soft=True))
+        return torch.stack([self._rolled[step].positions for step in steps])
+
+    @torch.no_grad()
+    def images(self, cams: Sequence[int], steps: range, beside: Splats | None = None) -> Tensor:
+        """Returns images [S, V, H, W, 3] in [0, 1] of the object at ``steps``, with others ``beside`` it."""
+        means = [self._bound(anchors) for anchors in self.anchors(steps)]
         cameras = [self.scene.cameras_at(cams, [step]).to(self.device) for step in steps]
-        means = [self._bound(self._rolled[step].positions) for step in steps]
         drawn = [self.object.render(*pair, beside) for pair in zip(cameras, means, strict=True)]
         return torch.stack(drawn).clamp(0, 1)
 
@@ -340,18 +349,6 @@ class Splats:
         quats = means.new_tensor([1.0, 0, 0, 0]).expand(len(means), 4)
         opacities, colors = joined["opacities"].sigmoid(), joined["colors"].sigmoid()
         return rasterize_gaussians(means, quats, scales, opacities, cameras, colors=colors).color
-
-
-def _facts(scene: Scene) -> dict:
-    """What the generator wrote about a scene; of other scenes nothing that is asked for."""
-    file = scene.path / "metadata.json"
-    return read_json(file) if file.is_file() else {}
-
-
-def _ground_height(scene: Scene) -> float | None:
-    """Metres along z: what the generator wrote, else 0; None if it left the ground out."""
-    height = _facts(scene).get("ground_height", 0.0)
-    return None if height is None else float(height) - float(scene.world_offset[2])
 
 
 def _extent(cameras: Cameras) -> float:

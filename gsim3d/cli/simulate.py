@@ -79,7 +79,8 @@ def run(args: argparse.Namespace) -> int:
     first = args.start + n_trained - restored.n_encoded
     trust = None if args.max_error is None else trust_of(simulator, args.checkpoint)
     with progress(None, "simulating", n_future, unit="step", quiet=args.quiet) as bar:
-        prediction = predict(restored, scene, context, n_future, first, edits, bar.update, trust is not None)
+        options = {"start": first, "edits": edits, "on_steps": bar.update, "with_spread": trust is not None}
+        prediction = predict(restored, scene, context, n_future, **options)
     bounds = None if trust is None else trust.bound(prediction.spread)
     write_prediction(out, restored, scene, prediction, cams, first, player=args.html, quiet=args.quiet, bounds=bounds)
     rested = f" ({prediction.resting:.0%} of the particles at rest, not computed)" if prediction.resting else ""

@@ -18,8 +18,9 @@ from gsim3d.data.fitting import Fitting, fit, own_depths, resample
 from gsim3d.data.images import ImageCache
 from gsim3d.data.lenses import Undistorter
 from gsim3d.data.masks import background_image, foreground
-from gsim3d.data.recording import BACKGROUND, MOVING, Problems, ReadImages, Recording
+from gsim3d.data.recording import BACKGROUND, MOVING, Problems, ReadImages, Recording, read_json
 from gsim3d.errors import InputError
+from gsim3d.io.plain import is_number
 
 CACHE_VERSION = 2  # increase when readers decode the same files differently
 SIZE_MULTIPLE = 16  # pixels; image sizes are padded to a multiple, which the encoders of all presets accept
@@ -107,6 +108,20 @@ class Scene:
     def bounds(self) -> np.ndarray:
         """Bounding box of the scene, float64 [2, 3] metres; if not given, the region that most cameras see."""
         return shared_view(*self._view()) if self.recording.bounds is None else self.recording.bounds
+
+    @cached_property
+    def generated(self) -> dict:
+        """What the generator wrote to metadata.json; of other scenes nothing that is asked for."""
+        file = self.path / "metadata.json"
+        return read_json(file) if file.is_file() else {}
+
+    @property
+    def ground_height(self) -> float | None:
+        """Metres along z: what the generator wrote, else 0; None if it left the ground out."""
+        height = self.generated.get("ground_height", 0.0)
+        if height is not None and not is_number(height, float):
+            raise InputError(f"{self.path}: metadata.json: ground_height must be metres or null; got {height!r}")
+        return None if height is None else float(height) - float(self.world_offset[2])
 
     @property
     def own_depths(self) -> tuple[float, float] | None:

@@ -1,10 +1,11 @@
 """Physical measures of moving points by step: momentum, energy, rigidity, penetration, permanence.
 
-Every point has the same weight. Predicted points are particles on visible surfaces, true ones the nodes of the
-generator's bodies, so compare how measures change rather than their values.
+Every point has the same weight. Points are particles on visible surfaces; the truth is of the same points, where the
+generator's bodies carry them from the last given step on.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from gsim3d.data import Scene
 from gsim3d.data.actions import UNREADABLE
 from gsim3d.errors import InputError
 from gsim3d.state import DYNAMIC, Particles
+from gsim3d.synth.embedding import ParticleCloud
 
 GRAVITY = 9.81  # m/s^2
 MARGIN = 0.5  # metres around the scene's bounds
@@ -25,27 +27,30 @@ class Measure:
     """A physical measure."""
 
     label: str  #: name and unit in tables
-    formula: str  #: definition, with v the velocity from the step before, x the position, and <> the mean over points
+    formula: str  #: definition, with v the velocity from the step before, h the mean height of both, <> over points
     digits: int  #: number of decimals in tables
 
 
 MEASURES = {
     "momentum": Measure("momentum [m/s]", "|<v>|", 3),
-    "energy": Measure("energy [J/kg]", "<|v|^2> / 2 + 9.81 <z>", 3),
+    "energy": Measure("energy [J/kg]", "<|v|^2> / 2 + 9.81 <h>", 3),
     "rigidity": Measure("rigidity [m]", "rms distance to the rigid motion of each body since the last given step", 4),
-    "penetration": Measure("penetration [m]", "<max(0, -z)>", 4),
+    "penetration": Measure("penetration [m]", "<max(0, ground - z)>", 4),
     "permanence": Measure("permanence", f"share of points within {MARGIN} m of the scene's bounds", 3),
 }
 
 
-def measure(points: Tensor, bodies: Tensor, fps: float, bounds: Tensor | None = None) -> dict[str, Tensor]:
+def measure(
+    points: Tensor, bodies: Tensor, fps: float, bounds: Tensor | None = None, ground: float | None = 0.0
+) -> dict[str, Tensor]:
     """Returns each measure of MEASURES at every step after the first, float64 [S - 1].
 
     Args:
-        points: [S, N, 3] metres, in correspondence over the steps; z is up and the ground at 0.
+        points: [S, N, 3] metres, in correspondence over the steps; z is up.
         bodies: int64 [N], the body of each point.
         fps: steps per second.
         bounds: [2, 3] metres; None: all of space.
+        ground: its height in metres; None: there is none, and penetration is NaN.
 
     Raises:
         InputError: there are fewer than two steps, or no points.
@@ -54,16 +59,16 @@ def measure(points: Tensor, bodies: Tensor, fps: float, bounds: Tensor | None = 
     if points.ndim != 3 or points.shape[0] < 2 or points.shape[1] == 0:
         raise InputError(f"measure: points must be [S >= 2, N >= 1, 3]; got {list(points.shape)}")
     velocities = points.diff(dim=0) * fps
-    later, height = points[1:], points[1:, :, 2]
-    inside = torch.ones_like(height)
+    later, heights = points[1:], points[..., 2].mean(1)
+    inside = torch.ones_like(later[..., 0])
     if bounds is not None:
         low, high = bounds.double()
         inside = ((later >= low - MARGIN) & (later <= high + MARGIN)).all(-1).double()
     return {
         "momentum": velocities.mean(1).norm(dim=1),
-        "energy": velocities.square().sum(-1).mean(1) / 2 + GRAVITY * height.mean(1),
+        "energy": velocities.square().sum(-1).mean(1) / 2 + GRAVITY * (heights[1:] + heights[:-1]) / 2,
         "rigidity": _residuals(points, bodies).square().mean(1).sqrt(),
-        "penetration": (-height).clamp_min(0).mean(1),
+        "penetration": ((math.nan if ground is None else ground) - later[..., 2]).clamp_min(0).mean(1),
         "permanence": inside.mean(1),
     }
 
@@ -82,19 +87,37 @@ def _residuals(points: Tensor, bodies: Tensor) -> Tensor:
     return distances
 
 
-def measure_particles(
-    particles: Particles, scene: Scene, first: int, truth: Sequence[Tensor] | None
-) -> dict[str, Tensor]:
-    """Measures the moving particles of clouds ``first`` (the last given step) and later, one cloud a step with the same
-    particles; empty if none moves. ``truth``: true nodes [N, 3] of each body at ``first``, to tell bodies apart; None:
-    one body."""
-    points = moving_points(particles, range(first, particles.n_clouds))
-    if points.shape[1] == 0:
-        return {}
-    bodies = torch.zeros(points.shape[1], dtype=torch.int64)
-    if truth is not None:
-        bodies = nearest_body(points[0], truth)
-    return measure(points, bodies, scene.fps, torch.from_numpy(scene.bounds))
+def measure_tracks(tracks: Mapping[str, Tensor], scene: Scene, steps: range) -> dict[str, dict[str, Tensor]]:
+    """Measures the moving points [S, N, 3] of each method over ``steps``, of which the first is the last given one.
+
+    Methods without points are left out. The first of the others has the "truth" beside it, if the scene has its states.
+    """
+    states, found = true_states(scene), {}
+    given = scene.fps, torch.from_numpy(scene.bounds), scene.ground_height
+    for name, points in tracks.items():
+        if points.shape[1] == 0:
+            continue
+        bodies = torch.zeros(points.shape[1], dtype=torch.int64)
+        if states is not None:
+            true, bodies = carried(points[0], [nodes[steps.start : steps.stop] for nodes in states])
+            found.setdefault("truth", measure(true, bodies, *given))
+        found[name] = measure(points, bodies, *given)
+    return found
+
+
+def carried(points: Tensor, bodies: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """Returns where bodies, nodes [S, M, 3] each, carry ``points`` [N, 3] of their first step, float64 [S, N, 3], and
+    which carries each, int64 [N]: that of the nearest node; of the 4 axes of a rigid one, the first is its origin."""
+    points = points.double()
+    starts = [own[0, :1] if own.shape[1] == 4 else own[0] for own in bodies]
+    body = torch.stack([torch.cdist(points, start.double()).amin(1) for start in starts]).argmin(0)
+    moved = points.repeat(min(map(len, bodies)), 1, 1)
+    for number, nodes in enumerate(bodies):
+        if (own := body == number).any():
+            cloud = ParticleCloud(nodes.double().numpy())
+            binding = cloud.bind(points[own].numpy())
+            moved[:, own] = torch.from_numpy(np.stack([binding.move(cloud.nodes[step]) for step in range(len(moved))]))
+    return moved, body
 
 
 def moving_points(particles: Particles, steps: Sequence[int]) -> Tensor:
@@ -125,25 +148,11 @@ def fall_ratio(given: Sequence[float], height: float, n_steps: int, fps: float) 
     return float((given[-1] - height) / (GRAVITY / 2 * time**2 - velocity * time))
 
 
-def nearest_body(points: Tensor, truth: Sequence[Tensor]) -> Tensor:
-    """Returns the body int64 [N] that each of ``points`` [N, 3] is on, by the nodes [M, 3] of each body in ``truth``;
-    of the 4 axes of a rigid one, the first is its origin."""
-    nodes = [own[:1] if len(own) == 4 else own for own in truth]
-    return torch.stack([torch.cdist(points.double(), own.double()).amin(1) for own in nodes]).argmin(0)
-
-
-def measure_truth(states: Sequence[Tensor], scene: Scene, steps: range) -> dict[str, Tensor]:
-    """Measures the true nodes of all bodies over ``steps``, of which the first is the last given one."""
-    points = torch.cat([nodes[list(steps)] for nodes in states], 1)
-    bodies = torch.cat([torch.full((nodes.shape[1],), k) for k, nodes in enumerate(states)])
-    return measure(points, bodies, scene.fps, torch.from_numpy(scene.bounds))
-
-
 def true_states(scene: Scene) -> list[Tensor] | None:
-    """Returns the nodes [T, N, 3] of each body and cloth as generated; None if the scene has no ``states.npz``. Raises
-    InputError if it is damaged, or does not fit the scene."""
+    """Returns the nodes [S, N, 3] of each body and cloth as generated, at the scene's steps; None if it has no
+    ``states.npz``, or is not in metres. Raises InputError if the file is damaged, or shorter than the scene."""
     file = scene.path / "states.npz"
-    if not file.is_file():
+    if not file.is_file() or scene.fitting.unit_cameras:
         return None
     try:
         with np.load(file, allow_pickle=False) as states:
@@ -153,5 +162,9 @@ def true_states(scene: Scene) -> list[Tensor] | None:
     for nodes in found:
         if nodes.ndim < 3 or nodes.shape[-1] != 3 or not nodes.isfinite().all():
             raise InputError(f"{file}: each body must be [T, ..., 3] finite numbers; got {list(nodes.shape)}")
-    flat = [nodes.flatten(1, -2) for nodes in found]
-    return [nodes[:, ~(nodes == 0).all(-1).any(0)] for nodes in flat]  # a lattice has unused nodes, at the origin
+    stride = round(scene.generated.get("fps", scene.fps) / scene.fps)
+    flat = [nodes[::stride].flatten(1, -2) for nodes in found]
+    if flat and min(map(len, flat)) < scene.n_steps:
+        raise InputError(f"{file}: {min(map(len, found))} steps, fewer than the scene has")
+    # A lattice has unused nodes, at the origin.
+    return [nodes[:, ~(nodes == 0).all(-1).any(0)] - torch.from_numpy(scene.world_offset) for nodes in flat] or None

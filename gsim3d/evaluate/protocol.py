@@ -29,7 +29,7 @@ from gsim3d.data.recording import BACKGROUND, MOVING
 from gsim3d.dynamics import RestLog, concatenate
 from gsim3d.effects.edits import Edit
 from gsim3d.errors import FitWarning, InputError, NumericalError
-from gsim3d.evaluate.physics import measure_particles, measure_truth, true_states
+from gsim3d.evaluate.physics import measure_tracks, moving_points
 from gsim3d.evaluate.predictions import Predictions
 from gsim3d.evaluate.scoring import ALONE, EXACT_PARTS, NEEDS_LABELS, PLAIN_METRICS, SceneScores, SceneTruth
 from gsim3d.io.terminal import progress
@@ -114,18 +114,8 @@ def _check_count(n_future: int) -> None:
         raise InputError(f"the number of steps to predict must be at least 1; got {n_future}")
 
 
-def predict(
-    restored: Restored,
-    scene: Scene,
-    context_cams: Sequence[int],
-    n_future: int,
-    start: int = 0,
-    edits: Sequence[Edit] = (),
-    on_steps: Callable[[int], object] | None = None,
-    with_spread: bool = False,
-) -> Prediction:
+def predict(restored: Restored, scene: Scene, context_cams: Sequence[int], n_future: int, **options) -> Prediction:
     """Predicts one scene, see :func:`predict_together`."""
-    options = {"start": start, "edits": edits, "on_steps": on_steps, "with_spread": with_spread}
     return predict_together(restored, [scene], n_future, [context_cams], **options)[0]
 
 
@@ -313,16 +303,16 @@ def score_scene(
     valid = None if valid is None else valid.to(device)
     truth = SceneTruth(scene.name, images, labels, valid, n_encoded, metrics)
 
-    physics: dict[str, dict[str, Tensor]] = {}
+    tracks: dict[str, Tensor] = {}
 
     def predicted() -> Iterator[tuple[str, Tensor]]:
         baselines: dict[str, Callable[[], Tensor]] = {
             "copy": lambda: images[n_encoded - 1].expand(n_future, *images.shape[1:])
         }
         if restored is not None:
-            made = prediction or predict(restored, scene, context_cams, n_future, start)
+            made = prediction or predict(restored, scene, context_cams, n_future, start=start)
             rendered = render_steps(restored, made.particles, scene, cams, start)
-            physics.update(_physics(scene, made, range(n_given - 1, n_given + n_future)))
+            tracks.update(_tracks(made))
             yield "model", rendered
             baselines = {
                 "constant": lambda: _held(restored, made, rendered, n_encoded - 1, scene, cams, start),
@@ -334,6 +324,8 @@ def score_scene(
             theirs = other.images(scene, cams, n_given, n_future).to(device).float() / 255
             if scene.recording.real_background and labels is not None:  # the true images are masked, too
                 theirs *= (labels[n_encoded:] != BACKGROUND)[..., None]
+            if hasattr(other, "points"):
+                tracks[other.name] = other.points(scene, cams, n_given, n_future)
             yield other.name, theirs
         yield from ((name, make()) for name, make in baselines.items() if name in methods)
 
@@ -347,21 +339,17 @@ def score_scene(
         objects, own = images * (labels == MOVING)[..., None], [m for m in metrics if m not in (*NEEDS_LABELS, "fvd")]
         truth = SceneTruth(scene.name, objects, labels, valid, n_encoded, own)
         scores.values.update(truth.score(alone).values)
+    physics = measure_tracks(tracks, scene, range(n_given - 1, n_given + n_future))
     return dataclasses.replace(scores, digest=digest, physics=physics)
 
 
-def _physics(scene: Scene, prediction: Prediction, steps: range) -> dict[str, dict[str, Tensor]]:
-    """Physical measures of the predicted particles and of the truth; ``steps`` begin with the last given one."""
-    states, last = true_states(scene), prediction.n_encoded - 1
-    if states is not None and min(len(nodes) for nodes in states) < steps.stop:
-        states = None
-    nodes = None if states is None else [body[steps.start] for body in states]
+def _tracks(prediction: Prediction) -> dict[str, Tensor]:
+    """Moving points [S, N, 3] of the model and its baselines from the last given step on."""
+    last = prediction.n_encoded - 1
     held = concatenate([prediction.step(last), constant_velocity(prediction)])
-    found = {
-        "model": measure_particles(prediction.particles, scene, last, nodes),
-        "constant_velocity": measure_particles(held, scene, 0, nodes),
-    }
-    return found if states is None else {**found, "truth": measure_truth(states, scene, steps)}
+    model = moving_points(prediction.particles, range(last, prediction.n_steps))
+    velocity = moving_points(held, range(held.n_clouds))
+    return {"model": model, "constant": model[:1].expand_as(model), "constant_velocity": velocity}
 
 
 def score_scenes(

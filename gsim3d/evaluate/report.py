@@ -95,9 +95,9 @@ def summarize(scores: Sequence[SceneScores], not_measured: dict[str, str] | None
 def _mean_physics(scores: Sequence[SceneScores], n_future: int) -> dict:
     """Means over scenes of what all scenes have."""
     found: dict = {}
-    for method in ("truth", "model", "constant_velocity"):
+    for method in dict.fromkeys(method for s in scores for method in s.physics):
         known = [s.physics.get(method) for s in scores]
-        if known and all(known):
+        if all(known):
             found[method] = {m: _numbers(torch.stack([k[m][:n_future] for k in known]).mean(0)) for m in MEASURES}
     return found
 
@@ -112,9 +112,10 @@ def physics_table(summary: dict) -> list[str]:
     lines = ["", _row(head), _row(["---"] * len(head))]
     for name, measure in MEASURES.items():
         for method, values in summary["physics"].items():
-            lines.append(_row([measure.label, method, *(f"{values[name][step]:.{measure.digits}f}" for step in steps)]))
+            shown = ("-" if (v := values[name][step]) is None else f"{v:.{measure.digits}f}" for step in steps)
+            lines.append(_row([measure.label, method, *shown]))
     formulas = "; ".join(f"{name}: {measure.formula}" for name, measure in MEASURES.items())
-    return [*lines, "", f"Per unit mass, points weighted equally, v from one step to the next: {formulas}."]
+    return [*lines, "", f"Per unit mass, points weighted equally, v from one step to the next, h halfway: {formulas}."]
 
 
 def _add_fvd(result: dict, missing: dict, scores: Sequence[SceneScores]) -> None:

@@ -13,14 +13,13 @@ import torch
 
 from gsim3d.data import Scene
 from gsim3d.errors import InputError
-from gsim3d.evaluate.physics import nearest_body, true_states
+from gsim3d.evaluate.physics import carried, true_states
 from gsim3d.evaluate.protocol import Prediction, default_views, input_frames, predict_together
 from gsim3d.evaluate.report import write_json
 from gsim3d.io.terminal import progress
 from gsim3d.numerics.speed import encode
 from gsim3d.numerics.trust import LEAST_SPREAD, TRUST_FILE, Trust, input_measures, read_checkpoints
 from gsim3d.state import DYNAMIC
-from gsim3d.synth.embedding import ParticleCloud
 from gsim3d.train.restore import Restored
 
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
@@ -42,25 +41,17 @@ def samples(scene: Scene, prediction: Prediction) -> Samples | None:
     moving = given.activity == DYNAMIC
     if states is None or not bool(moving.any()):
         return None
-    n_steps = min(prediction.n_steps, *map(len, states)) - prediction.n_encoded
-    points = given.means[moving].double().cpu()
-    body, truth = nearest_body(points, [nodes[last] for nodes in states]), np.zeros((n_steps, len(points), 3))
-    for number, nodes in enumerate(states):
-        own = (body == number).numpy()
-        cloud = ParticleCloud(nodes[last : last + n_steps + 1].double().numpy())
-        binding = cloud.bind(points[own].numpy()) if own.any() else None
-        for step in range(n_steps if binding else 0):
-            truth[step, own] = binding.move(cloud.nodes[step + 1])
-    later = (prediction.step(prediction.n_encoded + step).means[moving] for step in range(n_steps))
-    means = torch.stack(list(later)).double().cpu().numpy()
-    return prediction.spread[:n_steps, moving].double().cpu().numpy(), np.linalg.norm(means - truth, axis=-1)
+    truth = carried(given.means[moving].cpu(), [nodes[last : prediction.n_steps] for nodes in states])[0][1:]
+    later = (prediction.step(prediction.n_encoded + step).means[moving] for step in range(len(truth)))
+    error = (torch.stack(list(later)).double().cpu() - truth).norm(dim=-1)
+    return prediction.spread[: len(truth), moving].double().cpu().numpy(), error.numpy()
 
 
-def collect(restored: Restored, scenes: Sequence[Scene], n_future: int, quiet: bool = False) -> list[Samples]:
+def collect(restored: Restored, scenes: Sequence[Scene], n_future: int) -> list[Samples]:
     """Predicts scenes with their spread; returns the samples of those with known motion. Raises InputError if there is
     none."""
     found = []
-    for scene in progress(list(scenes), "trust", unit="scene", quiet=quiet):
+    for scene in progress(list(scenes), "trust", unit="scene"):
         made = samples(scene, predict_together(restored, [scene], n_future, with_spread=True)[0])
         found += [] if made is None else [made]
     if not found:
@@ -68,7 +59,7 @@ def collect(restored: Restored, scenes: Sequence[Scene], n_future: int, quiet: b
     return found
 
 
-def calibrate(restored: Restored, scenes: Sequence[Scene], n_future: int, quiet: bool = False) -> Trust:
+def calibrate(restored: Restored, scenes: Sequence[Scene], n_future: int) -> Trust:
     """Fits bounds of errors and ranges of inputs to validation scenes.
 
     Inputs are measured at the first step and in the middle of each scene.
@@ -77,14 +68,13 @@ def calibrate(restored: Restored, scenes: Sequence[Scene], n_future: int, quiet:
         restored: the model.
         scenes: scenes opened by ``restored``.
         n_future: number of steps to predict.
-        quiet: hide the progress bar.
 
     Raises:
         InputError: no scene has a known motion, or there are fewer than two scenes.
     """
     if len(scenes) < 2:
         raise InputError(f"trust: needs two or more scenes to calibrate; got {len(scenes)}")
-    found = fit_bounds(collect(restored, scenes, n_future, quiet))
+    found = fit_bounds(collect(restored, scenes, n_future))
     measured = []
     for scene in scenes:
         for start in (0, (scene.n_steps - restored.n_encoded) // 2):
@@ -103,13 +93,14 @@ def fit_bounds(pairs: Sequence[Samples]) -> dict:
     """Fields of :class:`Trust` that map spread and step to bounds of the error."""
     spread, step, error = flat(pairs)
     features, target = np.log([spread + LEAST_SPREAD, step]), np.log(error + LEAST_ERROR)
-    powers = np.zeros(2)
-    for chosen in ([0, 1], [0], [1]):  # the first fit without a negative power
-        design = np.stack([*features[chosen], np.ones_like(target)], 1)
-        powers[chosen] = np.linalg.lstsq(design, target, rcond=None)[0][:-1]
+    fits = []  # of non-negative powers; the best one counts
+    for chosen in ([], [0], [1], [0, 1]):
+        design, powers = np.stack([*features[chosen], np.ones_like(target)], 1), np.zeros(2)
+        solution = np.linalg.lstsq(design, target, rcond=None)[0]
+        powers[chosen] = solution[:-1]
         if (powers >= 0).all():
-            break
-        powers[:] = 0
+            fits.append((((design @ solution - target) ** 2).sum(), tuple(powers)))
+    powers = np.array(min(fits)[1])
     score = powers @ features
     bins = np.array_split(np.argsort(score, kind="stable"), min(BINS, len(score)))
     quantiles = np.array([np.quantile(error[rows], LEVELS) for rows in bins])

@@ -139,6 +139,7 @@ def edit(case: Case) -> dict:
         free fall, after FALL_STEPS; "above_cm", how far above the raised ground the body ends.
     """
     scene, cam = case.scene(), case.targets[:1]
+    context = default_views(case.restored, scene, None, case.targets)[0]
     n_given, n_future = case.restored.n_encoded, min(EDIT_STEPS, horizon(scene, GIVEN, case.n_future))
     steps = np.linspace(n_given, n_given + n_future - 1, min(SHOWN, n_future)).round().astype(int).tolist()
     rows, points, heights = {"truth": true_images(scene, cam, steps)[:, 0]}, {}, []
@@ -146,7 +147,7 @@ def edit(case: Case) -> dict:
         edits = () if operation is None else (Edit(0, operation),)
         spec = dataclasses.replace(case.restored.plan.spec, structure=structure_of(edits))
         restored = dataclasses.replace(case.restored, plan=case.restored.simulator.plan(spec))
-        prediction = predict(restored, scene, default_views(restored, scene, None, case.targets)[0], n_future, 0, edits)
+        prediction = predict(restored, scene, context, n_future, edits=edits)
         rows[name] = as_bytes(render_steps(restored, prediction.particles, scene, cam))[steps, 0]
         points[name] = moving_points(prediction.particles, range(n_given, n_given + n_future))
         if operation is None:

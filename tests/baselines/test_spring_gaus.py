@@ -92,6 +92,8 @@ def test_evaluate_scores_baselines_without_a_checkpoint(data, quick, tmp_path):
     given = {"given": 4, "steps": 4, "cameras": TARGETS, "scenes": "all", "metrics": ["psnr", "psnr_body"]}
     evaluate(Job(data=str(data), baselines=["spring-gaus"], out=str(out), **given))
     report = json.loads(out.read_text())
+    energy = {name: values["energy"] for name, values in report["physics"].items()}
+    assert list(energy) == ["truth", "spring-gaus"] and energy["truth"] == pytest.approx(energy["spring-gaus"], rel=0.2)
     assert report["not_applicable"] == {} and "spring-gaus" in report["predictions"]
     assert report["spring-gaus.future.psnr"] > 18 and report["spring-gaus-object.future.psnr"] > 12
     assert "spring-gaus-object.future.psnr_body" not in report and report["fitted"]["spring-gaus"]["anchors"] == 64
@@ -103,8 +105,11 @@ def test_where_it_does_not_apply_it_says_why(data, quick, tmp_path, monkeypatch,
     scene, method = Scene.open(find_scenes(data)[0]), baseline("spring-gaus")
     with pytest.raises(InputError, match="0 cameras are left"):
         method.check(scene, list(range(scene.n_cams)), 4, 4)
-    for name, found in (("_facts", {"world": "cloth", "bodies": [0, 1]}), ("_count_bodies", 4)):
-        monkeypatch.setattr(spring_gaus, name, lambda scene, found=found: found)
+    for place, name, found in (
+        (Scene, "generated", {"world": "cloth", "bodies": [0, 1]}),
+        (spring_gaus, "_count_bodies", lambda scene: 4),
+    ):
+        monkeypatch.setattr(place, name, found)
         with pytest.raises(InputError, match=r"[34] bodies \(a cloth is one\), and it simulates one"):
             method.check(scene, [2], 4, 4)
     out = tmp_path / "metrics.json"

@@ -5,8 +5,16 @@ import math
 import pytest
 import torch
 
-from gsim3d.baselines import SpringState, advance_frame, bind, build_springs
-from gsim3d.baselines.spring_mass import advance_safely, connect, friction, softness
+from gsim3d.baselines.spring_mass import (
+    SpringState,
+    advance_frame,
+    advance_safely,
+    bind,
+    build_springs,
+    connect,
+    friction,
+    softness,
+)
 from gsim3d.errors import InputError, NumericalError
 
 

@@ -1,6 +1,5 @@
 """Physical measures against closed forms."""
 
-import dataclasses
 import math
 
 import numpy as np
@@ -8,11 +7,21 @@ import pytest
 import torch
 
 from gsim3d.data import Scene
+from gsim3d.data.fitting import Fitting
 from gsim3d.errors import InputError
-from gsim3d.evaluate.physics import MEASURES, fall_ratio, measure, measure_particles, shape_change, true_states
+from gsim3d.evaluate.physics import (
+    MEASURES,
+    fall_ratio,
+    measure,
+    measure_tracks,
+    moving_points,
+    shape_change,
+    true_states,
+)
 from gsim3d.evaluate.report import physics_table, summarize
 from gsim3d.evaluate.scoring import SceneScores
 from gsim3d.state import DYNAMIC, FROZEN, Particles
+from tests.data.made_scenes import edit_json
 from tests.tiny_scenes import write_scene
 
 ONE = torch.zeros(20, dtype=torch.int64)
@@ -23,13 +32,13 @@ def cloud(seed=0, n=20):
 
 
 def test_free_fall_keeps_its_energy():
-    fps = 1000.0
-    times = torch.arange(300).double()[:, None, None] / fps
+    fps = 24.0
+    times = torch.arange(12).double()[:, None, None] / fps
     down = torch.tensor([0.0, 0.0, 1.0]).double()
     points = cloud() + 5 * down + torch.tensor([0.3, 0.0, 0.0]) * times - 0.5 * 9.81 * times**2 * down
     found = measure(points, ONE, fps)
-    assert (found["energy"] / found["energy"][0] - 1).abs().max() < 1e-3
-    assert found["momentum"][-1].item() == pytest.approx(math.hypot(0.3, 9.81 * 0.2985), rel=1e-3)
+    assert (found["energy"] / found["energy"][0] - 1).abs().max() < 1e-12
+    assert found["momentum"][-1].item() == pytest.approx(math.hypot(0.3, 9.81 * 10.5 / fps), rel=1e-9)
     assert found["rigidity"].max() < 1e-9 and found["penetration"].max() == 0 and (found["permanence"] == 1).all()
 
 
@@ -54,6 +63,9 @@ def test_penetration_and_permanence():
     points[1, 5:10] = 9.0
     found = measure(points, ONE, 1.0, torch.tensor([[0.0, 0, 0], [1, 1, 1]]))
     assert found["penetration"].item() == pytest.approx(0.05) and found["permanence"].item() == pytest.approx(0.75)
+    raised = measure(points, ONE, 1.0, ground=0.25)["penetration"].item()
+    assert raised == pytest.approx((0.25 - points[1, :, 2]).clamp_min(0).mean().item()) and raised > 0.11
+    assert measure(points, ONE, 1.0, ground=None)["penetration"].isnan().all()
 
 
 def test_the_shape_of_the_worst_copy():
@@ -82,8 +94,7 @@ def test_points_without_steps_are_refused():
         measure(torch.zeros(1, 20, 3), ONE, 1.0)
 
 
-def test_particles_at_rest_do_not_count(tmp_path):
-    scene = Scene.open(write_scene(tmp_path / "a" / "0"))
+def test_particles_at_rest_do_not_count():
     activity = torch.tensor([FROZEN, DYNAMIC, DYNAMIC]).float()
     means = torch.zeros(3, 3)
     steps = [means, means + torch.tensor([0.1, 0, 0])]
@@ -92,9 +103,51 @@ def test_particles_at_rest_do_not_count(tmp_path):
         cloud_scene=torch.zeros(2, dtype=torch.int64), cloud_step=torch.arange(2),
         origin=torch.zeros(1, 3), dynamic_latents=torch.zeros(6, 1), static_latents=torch.zeros(6, 1),
     )  # fmt: skip
-    assert measure_particles(particles, scene, 0, None)["momentum"].item() == pytest.approx(0.1 * scene.fps, rel=1e-6)
-    still = dataclasses.replace(particles, activity=torch.full((6,), float(FROZEN)))
-    assert measure_particles(still, scene, 0, None) == {}
+    assert torch.equal(moving_points(particles, range(2)), torch.stack(steps)[:, 1:])
+
+
+def spinning(folder, n_steps=6, fps=12.0):
+    """A scene above a raised ground whose body moves at 0.3 m/s and turns by 3 rad/s about an axis of its own."""
+    scene = Scene.open(write_scene(folder, n_steps=n_steps))
+    spin = torch.tensor([[0, -2.4, 0], [2.4, 0, -1.8], [0, 1.8, 0]], dtype=torch.float64)
+    turns = torch.linalg.matrix_exp(torch.arange(n_steps)[:, None, None] / fps * spin)
+    centres = np.array([0.1, 0.2, 0.7]) + np.arange(n_steps)[:, None] / fps * [0.3, 0, 0]
+    axes = np.concatenate([np.zeros((1, 3)), np.eye(3)])
+    np.savez(scene.path / "states.npz", body=centres[:, None] + axes @ turns.mT.numpy())
+    edit_json(scene.path / "metadata.json", lambda facts: facts.update(ground_height=0.5, fps=fps))
+    return Scene.open(scene.path), torch.from_numpy(centres), turns
+
+
+def test_the_truth_of_a_spinning_body_is_of_its_points(tmp_path):
+    scene, centres, turns = spinning(tmp_path / "a" / "0")
+    shape = cloud(3) - cloud(3).mean(0)
+    true = centres[1:, None] + shape @ turns[1:].mT
+    tracks = {"none": true[:, :0], "model": centres[1] + (shape @ turns[1].T).expand_as(true), "other": true}
+    found = measure_tracks(tracks, scene, range(1, 6))
+    assert list(found) == ["truth", "model", "other"]
+    for name, values in found["truth"].items():
+        torch.testing.assert_close(values, found["other"][name], rtol=1e-6, atol=1e-6)
+    assert found["truth"]["momentum"].numpy() == pytest.approx(0.3) and found["truth"]["rigidity"].max() < 1e-7
+    chord = 2 * math.sin(1.5 / 12) * 12  # of a turn by 3 rad/s, in m/s at 1 m from the axis
+    axis = turns[1] @ torch.tensor([0.6, 0, 0.8]).double()  # the same in all frames
+    apart = (shape.square().sum(1) - (shape @ axis).square()).mean()
+    energy = (0.09 + chord**2 * apart) / 2 + 9.81 * 0.7
+    assert found["truth"]["energy"].numpy() == pytest.approx(energy.item())
+    at_rest = found["model"]
+    assert at_rest["momentum"].max() == 0 and at_rest["energy"].numpy() == pytest.approx(9.81 * 0.7)
+    below = (0.5 - tracks["model"][0, :, 2]).clamp_min(0).mean().item()
+    assert below > 0 and at_rest["penetration"].numpy() == pytest.approx(below)
+
+
+def test_the_truth_of_fewer_frames(tmp_path):
+    scene, centres, _ = spinning(tmp_path / "a" / "0", n_steps=9)
+    half = Scene.open(scene.path, fps=6.0)
+    assert half.n_steps == 5 and torch.equal(true_states(half)[0][:, 0], centres[::2])
+    assert true_states(Scene.open(scene.path, fitting=Fitting(unit_cameras=True))) is None
+    for height, said in (("0.5", "must be metres or null; got '0.5'"), (True, "got True")):
+        edit_json(scene.path / "metadata.json", lambda facts, height=height: facts.update(ground_height=height))
+        with pytest.raises(InputError, match=said):
+            assert Scene.open(scene.path).ground_height
 
 
 def test_states_of_the_generator(tmp_path):
@@ -104,16 +157,19 @@ def test_states_of_the_generator(tmp_path):
     nodes[1:, 0, 0] = 0  # of no cell of the lattice
     np.savez(scene.path / "states.npz", ball=nodes, actors=nodes)
     assert [body.shape for body in true_states(scene)] == [(scene.n_steps, 3, 3)]
-    for bad in (np.full((3, 2, 3), np.nan), np.zeros((3, 3)), np.array([{}], dtype=object)):
+    np.savez(scene.path / "states.npz", actors=nodes)
+    assert true_states(scene) is None
+    for bad in (np.full((9, 2, 3), np.nan), np.zeros((9, 3)), np.array([{}], dtype=object), nodes[1:]):
         np.savez(scene.path / "states.npz", ball=bad)
         with pytest.raises(InputError, match="states.npz"):
             true_states(scene)
 
 
 def test_report_shows_formulas_and_steps():
-    values = {name: torch.arange(4).double() for name in MEASURES}
+    values = {name: torch.arange(4).double() for name in MEASURES} | {"penetration": torch.full((4,), math.nan)}
     scores = SceneScores("a", 2, 6, {"model": {"psnr": torch.ones(6).double()}}, {}, {}, physics={"model": values})
     summary = summarize([scores])
     text = "\n".join(physics_table(summary))
     assert "| momentum [m/s] | model | 0.000 | 2.000 | 3.000 |" in text and "|<v>|" in text
+    assert "| penetration [m] | model | - | - | - |" in text
     assert physics_table({**summary, "physics": {}}) == []

@@ -176,7 +176,7 @@ def test_constant_velocity_is_exact_for_a_body_that_translates(restored, scene):
 def test_baselines_of_a_body_that_translates(restored, scene, monkeypatch):
     """The images show the hand-made body: continuing it is right, holding it is worse the longer it is held."""
     truth = falling_apart(restored, scene, 6)
-    monkeypatch.setattr(protocol, "predict", lambda *_: Prediction(truth, 2, (0, 2)))
+    monkeypatch.setattr(protocol, "predict", lambda *_, start: Prediction(truth, 2, (0, 2)))
     images = render_steps(restored, truth, scene, [3])
     monkeypatch.setattr(
         scene, "images", lambda cams, steps: (images * 255).round().to(torch.uint8).permute(0, 1, 4, 2, 3)
@@ -217,7 +217,7 @@ def test_baselines_are_seen_by_cameras_that_move(restored, scene, tmp_path, monk
         torch.testing.assert_close(images[:2, 0], still[step, 0].expand(2, 32, 32, 3))
         torch.testing.assert_close(images[2:, 0], still[step, 1].expand(2, 32, 32, 3))  # camera 3 is where 4 was
     body = falling_apart(restored, scene, 6)
-    monkeypatch.setattr(protocol, "predict", lambda *_: Prediction(body, 2, (0, 2)))
+    monkeypatch.setattr(protocol, "predict", lambda *_, start: Prediction(body, 2, (0, 2)))
     images = render_steps(restored, body, moving, [3])
     monkeypatch.setattr(
         moving, "images", lambda cams, steps: (images * 255).round().to(torch.uint8).permute(0, 1, 4, 2, 3)

@@ -143,6 +143,9 @@ def test_powers_are_never_negative():
     spread = np.exp(rng.normal(-5, 1, (8, 500)))
     found = calibration.fit_bounds([(spread, 1 / spread)])
     assert found["spread_power"] == 0 and found["step_power"] >= 0
+    step, noise = np.arange(1, 9)[:, None], rng.normal(0, 0.3, spread.shape)
+    found = calibration.fit_bounds([(step * np.exp(noise), step**2 * np.exp(-noise / 2))])  # less spread, larger errors
+    assert found["spread_power"] == 0 and found["step_power"] == pytest.approx(2, abs=0.05)
     assert calibration.rising([1, 3, 2, 4]) == [1, 2.5, 2.5, 4]
 
 

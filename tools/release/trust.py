@@ -1,10 +1,13 @@
 #!/usr/bin/env python
-"""Calibrates the trust in a shipped simulator, and measures how well it holds on held-out and on changed scenes.
+"""Calibrates the trust in a simulator, and measures how well it holds on held-out and on changed scenes.
 
     python tools/release/trust.py elastic-small --data runs/trust --out docs/results
+    python tools/release/trust.py elastic-gns --checkpoint runs/gns/elastic-gns.weights.safetensors --preset published \
+        --data runs/trust --out runs/gns --device cuda
 
 Generates sets of the simulator's world in DATA, predicts them with the spread of variants, writes trust.json beside the
-weights, and OUT/trust.json and OUT/trust.png for docs/results/trust.md. Every scene that is finished is kept in DATA.
+weights, and OUT/NAME.trust.json and OUT/NAME.trust.png for docs/results/trust.md. Killed and started again, it goes on:
+every scene that is finished is kept in DATA, for these weights.
 """
 
 import argparse
@@ -58,9 +61,9 @@ CHANGES = {
 CHANGED = 4  # trajectories of each
 
 
-def scenes_of(folder: Path, world: str, count: int, **options) -> list[Path]:
+def scenes_of(folder: Path, count: int, **options) -> list[Path]:
     """Generates ``count`` trajectories in ``folder``; returns them with the objects in turn."""
-    generate(folder, world, preset="diverse", n_trajectories=count, **options)
+    generate(folder, n_trajectories=count, **options)
     return sorted(find_scenes(folder), key=lambda path: (path.name, path.parent.name))[:count]
 
 
@@ -109,32 +112,34 @@ def detection(calibration: Trust, measured: list[dict]) -> dict:
     return {"scenes": len(found), "announced": sum(map(bool, found)), "measures": dict(names.most_common())}
 
 
-def measure(checkpoint: str, data: Path) -> tuple[dict, Trust, dict[str, list[trust.Samples]]]:
-    """Calibrates ``checkpoint``; returns the content of OUT/trust.json, the calibration, and the samples by set."""
-    restored, world = restore(checkpoint), checkpoint.split("-")[0]
+def measure(
+    name: str, checkpoint: str, data: Path, preset: str, device: str
+) -> tuple[dict, Trust, dict[str, list[trust.Samples]]]:
+    """Calibrates ``checkpoint``; returns what OUT/NAME.trust.json holds, the calibration, and the samples by set."""
+    restored = restore(checkpoint, device)
     restored.simulator.trust = None  # an older calibration announces nothing here
-    kept = data / "measured"
+    kind, data = {"world": name.split("-")[0], "preset": preset}, data / f"{name.split('-')[0]}-{preset}"
+    kept = data / "measured" / restored.checkpoint.digest[:16]
     kept.mkdir(parents=True, exist_ok=True)
     found, measured = {}, {}
-    for name, (count, predicted, options) in SETS.items():
-        folders = scenes_of(data / name, world, count, n_frames=FRAMES, **options)
-        starts = (0, (FRAMES - restored.n_encoded) // 2) if name == "validation" else (0,)
-        measured[name] = measures(restored, folders, kept / f"{name}.json", starts)
-        found[name] = pairs(restored, folders[:predicted], kept / name)
-    for name, options in CHANGES.items():
-        place = name.replace(",", "").replace(" ", "-").replace("%", "percent")
-        folders = scenes_of(
-            data / "changed" / place, world, CHANGED, **{"seed": VALIDATION_SEED, "n_frames": CHANGED_FRAMES, **options}
-        )
-        if name == UNDECLARED:
+    for part, (count, predicted, options) in SETS.items():
+        folders = scenes_of(data / part, count, n_frames=FRAMES, **kind, **options)
+        starts = (0, (FRAMES - restored.n_encoded) // 2) if part == "validation" else (0,)
+        measured[part] = measures(restored, folders, kept / f"{part}.json", starts)
+        found[part] = pairs(restored, folders[:predicted], kept / part)
+    for part, options in CHANGES.items():
+        place = part.replace(",", "").replace(" ", "-").replace("%", "percent")
+        given = {"seed": VALIDATION_SEED, "n_frames": CHANGED_FRAMES, **kind, **options}
+        folders = scenes_of(data / "changed" / place, CHANGED, **given)
+        if part == UNDECLARED:
             declare_lens(folders, TRUE_FOV)
-        measured[name] = measures(restored, folders, kept / f"{place}.json")
+        measured[part] = measures(restored, folders, kept / f"{place}.json")
     fitted = {**trust.fit_bounds(found["validation"]), **trust.fit_ranges(measured["validation"])}
     made = Trust(n_scenes=len(found["validation"]), n_steps=STEPS, **fitted)
     results = {
-        "checkpoint": checkpoint,
-        "sets": {name: trust.report(made, samples) for name, samples in found.items()},
-        "detection": {name: detection(made, one) for name, one in measured.items()},
+        "checkpoint": name,
+        "sets": {part: trust.report(made, samples) for part, samples in found.items()},
+        "detection": {part: detection(made, one) for part, one in measured.items()},
     }
     trust.save_trust(folder_of(checkpoint), restored.checkpoint.digest, made)
     return results, made, found
@@ -170,14 +175,17 @@ def draw(path: Path, results: dict, made: Trust, found: dict[str, list[trust.Sam
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0], allow_abbrev=False)
-    parser.add_argument("checkpoint", help="name of a shipped simulator, such as elastic-small")
+    parser.add_argument("name", help="world and size, such as elastic-small")
+    parser.add_argument("--checkpoint", help="where its weights are (default: those that come with gsim3d)")
     parser.add_argument("--data", type=Path, required=True, help="folder of the scenes; made if absent")
-    parser.add_argument("--out", type=Path, required=True, help="folder of trust.json and trust.png")
+    parser.add_argument("--out", type=Path, required=True, help="folder of NAME.trust.json and NAME.trust.png")
+    parser.add_argument("--preset", default="diverse", help="of its training's trajectories (default: diverse)")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     args = parser.parse_args(arguments)
-    results, made, found = measure(args.checkpoint, args.data)
+    results, made, found = measure(args.name, args.checkpoint or args.name, args.data, args.preset, args.device)
     args.out.mkdir(parents=True, exist_ok=True)
-    write_json(args.out / "trust.json", results)
-    draw(args.out / "trust.png", results, made, found)
+    write_json(args.out / f"{args.name}.trust.json", results)
+    draw(args.out / f"{args.name}.trust.png", results, made, found)
     for name, summary in results["sets"].items():
         print(f"{name}: {trust.table(summary)}")
     for name, one in results["detection"].items():
