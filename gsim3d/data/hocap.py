@@ -59,9 +59,8 @@ def read(folder: Path, problems: Problems) -> Recording:
     """Reads the sequence in ``folder``. Raises InputError if its description cannot be parsed."""
     sequence = _Sequence(folder, problems)
     cameras, n_steps = sequence.cameras(), sequence.n_steps
-    notes = [*sequence.notes, *sequence.check_rig(cameras)]
-    positions, valid = sequence.joints(cameras)
-    actions = _actions(positions, valid, sequence.types, notes)
+    sequence.notes += sequence.check_rig(cameras)
+    actions = sequence.actions(cameras)
     near, far = _depths(np.stack([camera.viewmats for camera in cameras]))
     return Recording.of_cameras(
         cameras,
@@ -75,41 +74,8 @@ def read(folder: Path, problems: Problems) -> Recording:
         far=far,
         bounds=WORKSPACE,
         actions=actions,
-        notes=tuple(notes),
+        notes=tuple(sequence.notes),
     )
-
-
-def hand_keypoints(folder: str | Path, problems: Problems | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the hand joints of a sequence in world coordinates, and where they are known.
-
-    Gaps of up to three frames are interpolated linearly.
-
-    Args:
-        folder: sequence.
-        problems: receives the errors found. Default: the first is raised.
-
-    Returns:
-        float32 [T, A, 3] metres, 0 where unknown, and bool [T, A]; A is 21 joints of each hand, the right hand's first,
-        and 0 without labels.
-    """
-    sequence = _Sequence(Path(folder), problems or Problems())
-    return sequence.joints(sequence.cameras())
-
-
-def _actions(
-    positions: np.ndarray, valid: np.ndarray, types: Sequence[str], notes: list[str]
-) -> RecordedActions | None:
-    """Returns the joints that are ever known, absent in long gaps (positions there: the nearest known); adds notes."""
-    points, held = np.flatnonzero(valid.any(0)), positions.astype(np.float64)
-    for point in points:
-        known = np.flatnonzero(valid[:, point])
-        held[:, point] = held[known[np.searchsorted((known[1:] + known[:-1]) / 2, np.arange(len(valid)))], point]
-    for side in SIDES:
-        absent = max((int((~valid[:, point]).sum()) for point in points if types[point].startswith(side)), default=0)
-        if absent:
-            notes.append(f"{side} hand: absent at {absent} of {len(valid)} frames")
-    names = tuple(types[point] for point in points)
-    return RecordedActions(held[:, points], names, valid[:, points]) if len(points) else None
 
 
 def _depths(viewmats: np.ndarray) -> tuple[float, float]:
@@ -294,11 +260,13 @@ class _Sequence:
         pixels[(pixels == ABSENT).any(1)] = np.nan
         return local @ pose[:3, :3].T + pose[:3, 3], pixels
 
-    def joints(self, cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
-        """Returns :func:`hand_keypoints`: the median over cameras, with short gaps interpolated."""
-        n = len(self.types)
-        positions = np.full((self.n_steps, n, 3), np.nan)
-        for frame in range(self.n_steps if n else 0):
+    def actions(self, cameras: Sequence[Camera]) -> RecordedActions | None:
+        """Returns the joints that are ever known, the median over cameras; adds notes on their absence.
+
+        Short gaps are interpolated. In long ones a joint is absent, and its position is the nearest known.
+        """
+        positions = np.full((self.n_steps, len(self.types), 3), np.nan)
+        for frame in range(self.n_steps if self.types else 0):
             seen = []
             for cam, camera in enumerate(cameras):
                 found = self._seen(cam, frame, camera)
@@ -307,16 +275,24 @@ class _Sequence:
                     break
             if seen:
                 positions[frame] = _median(np.stack(seen))
-        valid = ~np.isnan(positions).any(2)
-        for point in range(n):
-            known = np.flatnonzero(valid[:, point])
+        present, frames = ~np.isnan(positions).any(2), np.arange(self.n_steps)
+        points = np.flatnonzero(present.any(0))
+        for point in points:
+            known = np.flatnonzero(present[:, point])
+            held = positions[known[np.searchsorted((known[1:] + known[:-1]) / 2, frames)], point]
             for before, after in zip(known[:-1], known[1:]):
                 if 1 < after - before <= MAX_GAP + 1:
-                    share = (np.arange(before + 1, after) - before)[:, None] / (after - before)
+                    share = np.linspace(0, 1, after - before + 1)[:, None]
                     ends = positions[before, point], positions[after, point]
-                    positions[before + 1 : after, point] = ends[0] + share * (ends[1] - ends[0])
-                    valid[before + 1 : after, point] = True
-        return np.where(valid[..., None], positions, 0).astype(np.float32), valid
+                    held[before : after + 1] = ends[0] + share * (ends[1] - ends[0])
+                    present[before:after, point] = True
+            positions[:, point] = held
+        for side in SIDES:
+            absent = (~present[:, [p for p in points if self.types[p].startswith(side)]]).sum(0).max(initial=0)
+            if absent:
+                self.notes.append(f"{side} hand: absent at {absent} of {self.n_steps} frames")
+        names = tuple(self.types[point] for point in points)
+        return RecordedActions(positions[:, points], names, present[:, points]) if names else None
 
     def check_rig(self, cameras: Sequence[Camera]) -> list[str]:
         """Compares the joints of all cameras with the pixels in their labels; returns notes, reports a bad fit."""

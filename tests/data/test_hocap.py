@@ -16,7 +16,6 @@ from gsim3d.cli.main import main
 from gsim3d.data import Fitting, Scene, find_scenes, make_frames
 from gsim3d.data.cameras import project
 from gsim3d.data.check import check_scene, contact_sheet
-from gsim3d.data.hocap import hand_keypoints
 from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError
 from gsim3d.evaluate.protocol import predict
@@ -67,16 +66,16 @@ def test_box_of_known_pose_is_where_images_and_labels_show_it(scene, folder):
             assert (labels[:120] == np.where(mask > 0, 3, 1)).all()
 
 
-def test_joints_are_world_positions_with_short_gaps_interpolated(folder):
-    positions, valid = hand_keypoints(folder)
-    assert positions.shape == (N_FRAMES, 42, 3) and positions.dtype == np.float32
+def test_joints_are_world_positions_with_short_gaps_interpolated(scene):
+    positions, valid = scene.recording.actions.positions, scene.recording.actions.present
+    assert positions.shape == (N_FRAMES, 42, 3)
     for frame in (0, 3, 31):  # camera 0 has no label at frame 3
         np.testing.assert_allclose(positions[frame, :21], hand("right", frame), atol=1e-5)
         np.testing.assert_allclose(positions[frame, 21:], hand("left", frame), atol=1e-5)
     thirds = (2 * hand("left", 4) + hand("left", 7)) / 3
     np.testing.assert_allclose(positions[5, 21:], thirds, atol=1e-5)
     assert valid[:, :21].all() and valid[:20].all()
-    assert not valid[20:27, 21:].any() and (positions[20:27, 21:] == 0).all()
+    assert not valid[20:27, 21:].any() and (positions[22, 21:] == positions[19, 21:]).all()
 
 
 def test_actions_are_the_joints_absent_in_long_gaps(scene, tmp_path):
@@ -106,14 +105,14 @@ def test_both_versions_give_equal_tensors(scene, tmp_path):
     assert (older.images(range(3), range(6)) == scene.images(range(3), range(6))).all()
     assert (older.segmentation([1, 2], range(6)) == scene.segmentation([1, 2], range(6))).all()
     assert (older.segmentation([0], [3]) == 1).sum() == 160 * 120  # no file: nothing moves
-    assert older.recording.actions is None and hand_keypoints(older.path)[0].shape == (6, 0, 3)
+    assert older.recording.actions is None
 
 
 def test_one_side_with_two_rows_is_right_and_left(tmp_path):
     folder = write_hocap(tmp_path, gaps=False, n_frames=2)
     meta = yaml.safe_load((folder / "meta.yaml").read_text()) | {"mano_sides": ["left"]}
     (folder / "meta.yaml").write_text(yaml.safe_dump(meta))
-    np.testing.assert_allclose(hand_keypoints(folder)[0][1], hand("left", 1), atol=1e-5)
+    np.testing.assert_allclose(Scene.open(folder).recording.actions.positions[1], hand("left", 1), atol=1e-5)
 
 
 def test_serials_that_yaml_takes_for_numbers(tmp_path):
