@@ -168,7 +168,7 @@ class GraphNetwork(nn.Module):
         x = self.lift(torch.cat([apart, features], 1))
         nodes = ops.pool_mean(x, rows, cu_rows, check=False)
         again = self.checkpointing and self.training and torch.is_grad_enabled()
-        run = partial(checkpoint, use_reentrant=False, preserve_rng_state=False) if again else _call
+        run = partial(checkpoint, use_reentrant=False, preserve_rng_state=False) if again else nn.Module.__call__
         graph = Graph.of(stage, self.longest, at, earlier=True)
         nodes, _ = run(self.history, nodes, self.history_edge(graph.features(at)), graph)
         graph = Graph.of(stage, self.longest, at, earlier=False)
@@ -176,7 +176,3 @@ class GraphNetwork(nn.Module):
         for layer in self.layers:
             nodes, edges = run(layer, nodes, edges, graph)
         return self.lower(torch.cat([x, ops.unpool(nodes, rows, cu_rows, x.shape[0], check=False)], 1), x)
-
-
-def _call(layer: nn.Module, *arguments) -> tuple[Tensor, Tensor]:
-    return layer(*arguments)

@@ -11,7 +11,7 @@ import numpy as np
 from gsim3d.synth import pushing, scene_setup
 from gsim3d.synth.embedding import ParticleCloud, RigidFrame
 from gsim3d.synth.scene_setup import Pusher, Unstable
-from gsim3d.synth.world import SceneBody, SceneDraw, World
+from gsim3d.synth.world import SceneDraw, World
 
 # Options of World that have no effect where bodies rest at time 0 on a ground at height 0.
 RESTING = ("drop_height", "speed", "lift", "spin", "spread", "max_timestep")
@@ -110,7 +110,8 @@ class Push(World):
         return 0.0, None, bodies
 
     def _with_actors(self, drawn: SceneDraw, rng: np.random.Generator) -> SceneDraw:
-        centers = np.stack([_center(body) for body in drawn.bodies])
+        outlines = [body.vertices[:, :2] for body in drawn.bodies]
+        centers = np.stack([(outline.min(0) + outline.max(0)) / 2 for outline in outlines])
         scripted, speed = rng.random() < SCRIPTED, rng.uniform(*self.push_speed)
         for _ in range(TRIES):
             body, goal, start = _draw_push(centers, rng)
@@ -159,10 +160,6 @@ def place(rng: np.random.Generator, reach: float = ARENA) -> np.ndarray:
     """Draws a place [2] nearer than ``reach`` to the middle."""
     angle = rng.uniform(0, 2 * np.pi)
     return reach * np.sqrt(rng.random()) * np.array([np.cos(angle), np.sin(angle)])
-
-
-def _center(body: SceneBody) -> np.ndarray:
-    return (body.vertices[:, :2].min(0) + body.vertices[:, :2].max(0)) / 2
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

@@ -188,11 +188,9 @@ class Target:
     def colorings(self) -> tuple[str, ...]:
         """Those of COLORINGS that the target has values for."""
         known = {"appearance": True, "velocity": self.n_frames > 1 and self.gaussians(0) is not None}
-        known |= {"activity": bool(self.particles), "latents": self._has_latents(), "trust": self._bounds is not None}
+        latents = bool(self.particles) and self.particles[0].dynamic_latents.shape[1] > 0
+        known |= {"activity": bool(self.particles), "latents": latents, "trust": self._bounds is not None}
         return tuple(name for name in COLORINGS if known[name])
-
-    def _has_latents(self) -> bool:
-        return bool(self.particles) and self.particles[0].dynamic_latents.shape[1] > 0
 
     def displacements(self, frame: int) -> Tensor:
         """[N, 3] metres since the frame before; 0 where its particles are others."""

@@ -6,6 +6,7 @@ to the steps below. What never changes is stored once; else the second differenc
 """
 
 import base64
+import html
 import json
 import zlib
 from collections.abc import Sequence
@@ -91,8 +92,8 @@ def write_player(
     )
     page = files("gsim3d.viewer").joinpath("player.html").read_text()
     script = files("gsim3d.viewer").joinpath("player.js").read_text()
-    filled = page.replace("{{title}}", _escaped(title)).replace("{{script}}", script).replace("{{blobs}}", scripts)
-    filled = filled.replace("{{poster}}", _jpeg(_poster(first, view, background)))
+    filled = page.replace("{{title}}", html.escape(title, quote=False)).replace("{{script}}", script)
+    filled = filled.replace("{{blobs}}", scripts).replace("{{poster}}", _jpeg(_poster(first, view, background)))
     content = filled.replace("{{header}}", json.dumps(header).replace("<", "\\u003c"))
     write_whole(path, content)
 
@@ -213,7 +214,3 @@ def _encoded(path: Path, images: Sequence[np.ndarray]) -> list[str]:
     if sum(map(len, out)) > MOST_IMAGES:
         raise InputError(f"{path}: its true images take over {MOST_IMAGES >> 20} MiB; give smaller ones")
     return out
-
-
-def _escaped(text: str) -> str:
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")

@@ -85,7 +85,8 @@ def load_depth_weights(encoder: Encoder, path: str | Path) -> list[str]:
 
 def _own_names(tensors: dict[str, Tensor], encoder: Encoder, path: str | Path) -> _Named:
     if any(name.startswith("model.") for name in tensors):
-        return {_renamed_start(name): (name, value) for name, value in tensors.items()}
+        starts = {name: next(filter(name.startswith, _DEPTH_ANYTHING), "") for name in tensors}
+        return {_DEPTH_ANYTHING.get(s, "") + n.removeprefix(s): (n, tensors[n]) for n, s in starts.items()}
     start = "backbone.model." if encoder.config.vit.architecture.timm else "backbone."
     if not any(name.startswith(("embeddings.", "encoder.layer.")) for name in tensors):
         return {start + name: (name, value) for name, value in tensors.items()}
@@ -96,10 +97,6 @@ def _own_names(tensors: dict[str, Tensor], encoder: Encoder, path: str | Path) -
             name = re.sub(pattern, new, name)
         found[start + name] = in_file, value
     return _with_joined_products(found, path)
-
-
-def _renamed_start(name: str) -> str:
-    return next((new + name[len(old) :] for old, new in _DEPTH_ANYTHING.items() if name.startswith(old)), name)
 
 
 def _with_joined_products(found: _Named, path: str | Path) -> _Named:
