@@ -56,7 +56,7 @@ class Video:
 
     def read(self, numbers: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:
         """Yields the frames of ascending ``numbers`` (may repeat), uint8 RGB [h, w, 3]; None on error."""
-        capture = _open(self._file, self.what + " ")
+        capture = open_video(self._file, self.what + " ")
         try:
             at, ended = -1, False
             for number in numbers:
@@ -85,7 +85,7 @@ class _Scan:
 def _scan(file: Path, size: tuple[int, int], stamp: tuple) -> _Scan:
     """Decodes a file once for the times of its frames; ``stamp`` is part of the key, errors do not name the file."""
     index = _index(file)
-    capture = _open(file)
+    capture = open_video(file)
     try:
         rate, count, turn = (
             capture.get(key) for key in (cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_COUNT, cv2.CAP_PROP_ORIENTATION_META)
@@ -122,7 +122,8 @@ def _scan(file: Path, size: tuple[int, int], stamp: tuple) -> _Scan:
     return _Scan(times, rate)
 
 
-def _open(file: Path, what: str = ""):
+def open_video(file: Path, what: str = ""):
+    """Returns the opened file; raises InputError if it is not a video."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # errors are reported here, with their file and camera
     capture = cv2.VideoCapture(opencv_path(file), cv2.CAP_FFMPEG)
     if not capture.isOpened():

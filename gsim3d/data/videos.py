@@ -73,6 +73,8 @@ def read(folder: Path, problems: Problems) -> Recording:
     labels = sources if masks == "alpha" else None
     if masks not in ("alpha", "subtract", "none"):
         labels = {name: _Frames(folder, Path(masks) / name, name, sizes[name]) for name in names}
+        for name in (name for name, frames in labels.items() if not frames.numbers):
+            problems.add(f"{source}: camera {name} has no images <number>.png or .jpg in {folder / masks / name}")
 
     def read_images(cam: int, steps: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:
         return sources[names[cam]].read([numbers[cam][step] for step in steps], problems)
