@@ -4,7 +4,7 @@ Pixel centres are OpenCV's (integers). The board's axes are OpenCV's too: x alon
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -32,6 +32,9 @@ class Board:
     marker: float = 0.0  #: side of a marker in metres; 0: 0.75 squares
     dictionary: str = "4X4_50"  #: OpenCV's name of the markers, such as "4X4_50"
 
+    def __post_init__(self):
+        self.made()
+
     def made(self):
         """Returns the board as an object of OpenCV; raises InputError if its measures are invalid."""
         known = [name.removeprefix("DICT_") for name in dir(cv2.aruco) if name.startswith("DICT_")]
@@ -40,10 +43,11 @@ class Board:
                 f"--dictionary: {self.dictionary!r} is none of OpenCV's{did_you_mean(self.dictionary, known)}"
             )
         marker = self.marker or MARKER_SHARE * self.square
-        if min(self.columns, self.rows) < 3 or not 0 < marker < self.square:
-            raise InputError(f"--board: needs 3 squares or more a side, and markers smaller than squares; got {self}")
+        whole = self.columns == int(self.columns) and self.rows == int(self.rows)
+        if not whole or min(self.columns, self.rows) < 3 or not 0 < marker < self.square:
+            raise InputError(f"--board: needs 3 whole squares or more a side, and smaller markers; got {self}")
         markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}"))
-        return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, marker, markers)
+        return cv2.aruco.CharucoBoard((int(self.columns), int(self.rows)), self.square, marker, markers)
 
 
 @dataclass(frozen=True)
@@ -63,9 +67,9 @@ class Calibrated:
 class _Views:
     """Detections of one camera: frame -> (object points [N, 1, 3], pixels [N, 1, 2], board -> camera)."""
 
-    found: dict[int, tuple] = field(default_factory=dict)
-    K: np.ndarray = None
-    distortion: np.ndarray = None
+    found: dict[int, tuple]
+    K: np.ndarray
+    distortion: np.ndarray
 
 
 def calibrate_board(films: Sequence[Film], offsets: Sequence[float], board: Board) -> list[Calibrated]:

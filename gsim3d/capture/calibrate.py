@@ -48,6 +48,8 @@ def calibrate(
     names = [film.name for film in films]
     if wrong := set(names) ^ {file.stem for file in next(iter(takes.values()))}:
         raise InputError(f"{folder / BOARD}: must have one film of each camera; {', '.join(sorted(wrong))} differ")
+    if scale and (scale[0] == scale[1] or not set(scale[:2]) <= set(names)):
+        raise InputError(f"--scale: {scale[0]} and {scale[1]} must be two of the cameras {', '.join(names)}")
     if board is None:
         say(f"calibrate: structure from motion of {len(films)} backgrounds, because no --board is given")
         cameras = calibrate_sfm(films)
@@ -95,8 +97,6 @@ def _scaled(cameras: list[Calibrated], scale, metric: bool, say) -> list[Calibra
         return cameras
     centres = {c.name: -c.viewmat[:3, :3].T @ c.viewmat[:3, 3] for c in cameras}
     first, second, metres = scale
-    if first == second or not {first, second} <= set(centres):
-        raise InputError(f"--scale: {first} and {second} must be two of the cameras {', '.join(centres)}")
     share = metres / float(np.linalg.norm(centres[first] - centres[second]))
     say(f"  scale: {first} and {second} are {metres:g} m apart, lengths are multiplied by {share:.4g}")
     step = np.array([1.0, 1.0, 1.0, share])
@@ -113,18 +113,12 @@ def _common_rate(films: Sequence[Film], say: Callable[[str], None]) -> float | N
 
 
 def _description(cameras: Sequence[Calibrated], offsets, agreement, resample: float | None) -> str:
-    entries = [
-        {
-            "name": camera.name,
-            "size": list(camera.size),
-            "K": camera.K.tolist(),
-            "R": camera.viewmat[:3, :3].tolist(),
-            "T": camera.viewmat[:3, 3].tolist(),
-            "distortion": camera.distortion.tolist(),
-            "offset": round(float(offset), 6),
-            "calibration": {"error": camera.error, "images": camera.views, "motion_agreement": float(own)},
-        }
-        for camera, offset, own in zip(cameras, offsets, agreement, strict=True)
-    ]
+    entries = []
+    for camera, offset, own in zip(cameras, offsets, agreement, strict=True):
+        K, R, T = camera.K.tolist(), camera.viewmat[:3, :3].tolist(), camera.viewmat[:3, 3].tolist()
+        entry = {"name": camera.name, "size": list(camera.size), "K": K, "R": R, "T": T}
+        entry |= {"distortion": camera.distortion.tolist(), "offset": round(float(offset), 6)}
+        found = {"error": camera.error, "images": camera.views, "motion_agreement": float(own)}
+        entries.append(entry | {"calibration": found})
     content = {"pixel_center": 0, **({} if resample is None else {"resample": resample}), "cameras": entries}
     return json.dumps(content, indent=1) + "\n"

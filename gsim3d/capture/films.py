@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,10 +11,9 @@ import cv2
 import numpy as np
 
 from gsim3d.data.recording import Problems, natural_order
-from gsim3d.data.video_file import Video
+from gsim3d.data.video_file import Video, open_video
 from gsim3d.data.videos import VIDEO_SUFFIXES
 from gsim3d.errors import InputError
-from gsim3d.io.files import opencv_path
 from gsim3d.io.terminal import progress
 
 BOARD = "board"  # folder with films of the board
@@ -25,6 +25,7 @@ MIN_VARIATION = 0.1  # of the motion, over its mean; films that show less are no
 MIN_FRAMES = 16
 REPEATED = 0.1  # of the median motion; frames that change less repeat the one before
 GRID = 4  # samples of the motion a frame
+APART = 3 * GRID  # samples between independent ones
 
 
 @dataclass(frozen=True)
@@ -37,11 +38,14 @@ class Film:
 
     @classmethod
     def open(cls, file: Path) -> Film:
-        """Opens a film; raises InputError if it cannot be decoded."""
-        capture = cv2.VideoCapture(opencv_path(file), cv2.CAP_FFMPEG)
+        """Opens a film; raises InputError if it cannot be decoded, or is a single picture."""
+        capture = open_video(file, f"{file} ")
         size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
         capture.release()
-        return cls(file.stem, size, Video(file, file.stem, size, Problems()))
+        video = Video(file, file.stem, size, Problems())
+        if len(video.times) < 2:
+            raise InputError(f"{video.what} has one frame")
+        return cls(file.stem, size, video)
 
     def grey(self, numbers: Sequence[int]):
         """Yields the frames of ascending ``numbers``, uint8 [h, w]."""
@@ -109,8 +113,8 @@ def time_offsets(times: Sequence[np.ndarray], motions: Sequence[np.ndarray]) -> 
     """Aligns films by the motion that they show.
 
     The lag of two films is the peak of the normalised cross-correlation of the relative change of their motion, which
-    depends less on the view than motion itself; the offsets are the least squares solution of all pairs, weighted by
-    correlation.
+    depends less on the view than motion itself, by its significance (Fisher's z): a few frames that happen to agree
+    count less than many. Offsets follow from the pairs whose peaks are most significant.
 
     Args:
         times: seconds of the frames of each of V films.
@@ -127,24 +131,17 @@ def time_offsets(times: Sequence[np.ndarray], motions: Sequence[np.ndarray]) -> 
         middle = (own[1:] + own[:-1]) / 2
         grid = np.arange(middle[0], middle[-1], step)
         signals.append((middle[0], np.gradient(_smooth(np.interp(grid, middle, np.log1p(values)), GRID))))
-    varied = [len(own) >= MIN_FRAMES and own.std() > MIN_VARIATION * own.mean() for own in motions]
-    rows, lags, weights, best = [], [], [], np.zeros(n)
-    for a in range(n):
-        for b in range(a + 1, n):
-            shift, agreement = (
-                _lag(signals[a][1], signals[b][1], round(MAX_LAG / step)) if varied[a] & varied[b] else (0, 0)
-            )
-            best[[a, b]] = np.maximum(best[[a, b]], agreement)
-            if agreement >= MIN_AGREEMENT:
-                rows.append((np.arange(n) == b) * 1.0 - (np.arange(n) == a))
-                lags.append(shift * step + signals[a][0] - signals[b][0])
-                weights.append(agreement)
-    if not rows:
-        return np.zeros(n), best
-    weights, rows = np.array(weights), np.stack(rows)
-    offsets = np.linalg.lstsq(rows * weights[:, None], np.array(lags) * weights, rcond=None)[0]
-    offsets[best < MIN_AGREEMENT] = 0
-    return offsets - offsets[0] * (best >= MIN_AGREEMENT), best
+    varied = [k for k, own in enumerate(motions) if len(own) >= MIN_FRAMES and own.std() > MIN_VARIATION * own.mean()]
+    pairs = {
+        (a, b): _lag(signals[a][1], signals[b][1], round(MAX_LAG / step)) for a, b in itertools.combinations(varied, 2)
+    }
+    best = np.array([max((r for pair, (_, r, _) in pairs.items() if k in pair), default=0.0) for k in range(n)])
+    offsets: dict[int, float] = {}
+    while joins := [p for p in pairs if pairs[p][1] >= MIN_AGREEMENT and len(offsets.keys() & p) == bool(offsets)]:
+        a, b = max(joins, key=lambda pair: pairs[pair][2])
+        apart = pairs[a, b][0] * step + signals[a][0] - signals[b][0]
+        offsets |= {a: offsets[b] - apart} if b in offsets else {b: offsets.setdefault(a, 0.0) + apart}
+    return np.array([offsets[k] - offsets.get(0, 0) if k in offsets else 0.0 for k in range(n)]), best
 
 
 def _smooth(values: np.ndarray, sigma: float) -> np.ndarray:
@@ -153,20 +150,20 @@ def _smooth(values: np.ndarray, sigma: float) -> np.ndarray:
     return np.convolve(np.pad(values, reach, mode="edge"), kernel / kernel.sum(), "valid")
 
 
-def _lag(a: np.ndarray, b: np.ndarray, most: int) -> tuple[float, float]:
-    """Returns by how many samples ``b`` must be delayed to match ``a``, and their correlation there."""
-    least = max(3, int(MIN_OVERLAP * min(len(a), len(b))))
-    lags = [lag for lag in range(-most, most + 1) if min(len(a), len(b) + lag) - max(0, lag) >= least]
-    found = []
-    for lag in lags:
+def _lag(a: np.ndarray, b: np.ndarray, most: int) -> tuple[float, float, float]:
+    """Returns by how many samples ``b`` must be delayed to match ``a``, and their correlation and its significance."""
+    least, found = max(3, int(MIN_OVERLAP * min(len(a), len(b)))), []
+    for lag in range(-most, most + 1):
         low, high = max(0, lag), min(len(a), len(b) + lag)
-        x, y = a[low:high] - a[low:high].mean(), b[low - lag : high - lag] - b[low - lag : high - lag].mean()
-        found.append((x * y).sum() / max(1e-12, np.sqrt((x * x).sum() * (y * y).sum())))
+        if high - low >= least:
+            x, y = a[low:high] - a[low:high].mean(), b[low - lag : high - lag] - b[low - lag : high - lag].mean()
+            r = float((x * y).sum() / max(1e-12, np.sqrt((x * x).sum() * (y * y).sum())))
+            found.append((lag, r, np.arctanh(min(r, 0.9999)) * np.sqrt(max(1, (high - low) / APART - 3))))
     if not found:
-        return 0.0, 0.0
-    top = int(np.argmax(found))
-    fine = 0.0
+        return 0.0, 0.0, 0.0
+    top = max(range(len(found)), key=lambda k: found[k][2])
+    (lag, r, z), fine = found[top], 0.0
     if 0 < top < len(found) - 1:
-        left, middle, right = found[top - 1 : top + 2]
-        fine = 0.5 * (left - right) / min(-1e-12, left - 2 * middle + right)
-    return lags[top] + fine, float(found[top])
+        left, right = found[top - 1][1], found[top + 1][1]
+        fine = float(np.clip(0.5 * (left - right) / min(-1e-12, left - 2 * r + right), -1, 1))
+    return lag + fine, r, float(z)

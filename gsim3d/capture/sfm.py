@@ -44,18 +44,12 @@ def calibrate_sfm(films: Sequence[Film]) -> list[Calibrated]:
         options = pycolmap.IncrementalPipelineOptions()
         options.min_model_size, options.mapper.init_min_num_inliers = 2, 30
         pycolmap.set_random_seed(0)
-        pycolmap.extract_features(
-            database,
-            images,
-            camera_mode=pycolmap.CameraMode.PER_IMAGE,
-            reader_options={"camera_model": "SIMPLE_RADIAL"},
-        )
+        cameras = {"camera_mode": pycolmap.CameraMode.PER_IMAGE, "reader_options": {"camera_model": "SIMPLE_RADIAL"}}
+        pycolmap.extract_features(database, images, **cameras)
         pycolmap.match_exhaustive(database)
         models = pycolmap.incremental_mapping(database, images, temporary, options)
     found = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
-    registered = (
-        {} if found is None else {Path(image.name).stem: image for image in found.images.values() if image.has_pose}
-    )
+    registered = {Path(image.name).stem: image for image in found.images.values() if image.has_pose} if found else {}
     lost = [film.name for film in films if film.name not in registered]
     if lost:
         raise InputError(

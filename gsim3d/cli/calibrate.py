@@ -45,16 +45,11 @@ def calibration_of(args: argparse.Namespace) -> dict[str, Any]:
     """Returns the arguments ``board`` and ``scale`` of :func:`gsim3d.capture.calibrate.calibrate`."""
     from gsim3d.capture.board import Board
 
-    board = scale = None
-    if args.board:
-        columns, rows, side = args.board
-        board = Board(int(columns), int(rows), side, args.marker, args.dictionary)
-    if args.scale:
-        first, second, metres = args.scale
-        try:
-            scale = first, second, number(0, above=True)(metres)
-        except (ValueError, argparse.ArgumentTypeError):
-            raise InputError(f"--scale: M must be a positive number of metres; got {metres!r}") from None
+    board = Board(*args.board, args.marker, args.dictionary) if args.board else None
+    try:
+        scale = args.scale and (*args.scale[:2], number(0, above=True)(args.scale[2]))
+    except (ValueError, argparse.ArgumentTypeError):
+        raise InputError(f"--scale: M must be a positive number of metres; got {args.scale[2]!r}") from None
     return {"board": board, "scale": scale}
 
 

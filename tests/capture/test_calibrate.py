@@ -109,6 +109,17 @@ def test_offsets_of_motion_are_found_within_a_fraction_of_a_frame():
     assert agreement.min() > 0.9
 
 
+def test_short_films_are_not_aligned_by_a_few_frames_that_agree():
+    wrong, smooth = 0, np.hanning(9) / np.hanning(9).sum()
+    for seed in range(30):
+        rng, starts = np.random.default_rng(seed), np.array([0, 5, 2])
+        common, *own = (np.convolve(rng.normal(size=64), smooth, "same") for _ in range(4))
+        views = [np.exp(1.5 * (common + share * view)) for view, share in zip(own, (0.18, 0.9, 0.18), strict=True)]
+        motions = [view[start : start + 56] for view, start in zip(views, starts, strict=True)]
+        wrong += np.abs(time_offsets([np.arange(57) / 42] * 3, motions)[0] - starts / 42).max() > 3 / 42
+    assert wrong <= 4
+
+
 def test_films_without_common_motion_keep_their_times():
     rng, times = np.random.default_rng(1), [np.arange(90) / 30] * 2
     still = time_offsets(times, [np.full(89, 2.0) + rng.normal(0, 0.01, 89) for _ in times])
@@ -183,6 +194,15 @@ def test_takes_are_found_or_refused(tmp_path, capsys):
     (tmp_path / "two" / "right.mp4").unlink()
     with pytest.raises(InputError, match=r"two: has films of left; every take needs .* same two cameras"):
         takes_of(tmp_path)
-    assert main(["calibrate", str(tmp_path), "--board", "2", "5", "0.1"]) == 2
+    for columns in ("2", "5.5"):
+        assert main(["calibrate", str(tmp_path), "--board", columns, "5", "0.1"]) == 2
+        assert "--board: needs 3 whole squares or more a side" in capsys.readouterr().err
     assert main(["calibrate", str(tmp_path), "--scale", "left", "right", "-3"]) == 2
     assert "M must be a positive number of metres; got '-3'" in capsys.readouterr().err
+
+
+def test_a_single_picture_is_no_film(tmp_path, capsys):
+    for name in ("left", "right"):
+        write_plain(tmp_path / f"{name}.mp4", 1)
+    assert main(["calibrate", str(tmp_path), "--board", "5", "4", "0.1"]) == 2
+    assert "left.mp4 (camera left) has one frame" in capsys.readouterr().err
