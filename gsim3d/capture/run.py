@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shlex
 import shutil
 import tempfile
 import time
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from gsim3d.capture import check, prepare
 from gsim3d.capture.board import Board
@@ -17,23 +19,29 @@ from gsim3d.capture.calibrate import calibrate
 from gsim3d.capture.films import BOARD, films_in
 from gsim3d.data import Scene, find_scenes, split_scenes
 from gsim3d.data.check import check_scene
+from gsim3d.data.recording import read_json
 from gsim3d.data.videos import FILE
 from gsim3d.errors import InputError
 from gsim3d.evaluate.protocol import score_scene
 from gsim3d.io.files import write_whole
 from gsim3d.io.locks import only_one_writer
 from gsim3d.io.settings import from_dict, to_dict
+from gsim3d.nn.multiview_encoder.config import ViTConfig
+from gsim3d.pretrained.loading import check_device
 from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, PhaseConfig, TrainConfig
+from gsim3d.train.log import LOG
 from gsim3d.train.loop import Trainer
 from gsim3d.train.restore import restore
 from gsim3d.train.run import train
 
 PHASES = ((0, 0.35, 2e-3), (3, 0.25, 1e-3), (12, 0.4, 1e-3))  # horizon, share of the time, learning rate
+DEPTH_RATE = 0.15  # learning rates from pretrained depth, relative to the others
 BATCH = {"cpu": 1, "cuda": 4}
 PROBED = 3  # optimizer steps of each phase that are timed
 SCORED_STEPS = 12  # predicted steps of a scored window
 MOST_WINDOWS = 24
-FILES = {"check": "check.json", "propose": "proposal.json", "train": "train.json", "score": "metrics.json"}
+# Files of the steps' results in the run folder, without their ending .json.
+FILES = {"check": "check", "propose": "proposal", "settings": "settings", "train": "train", "score": "metrics"}
 
 
 def capture(
@@ -44,6 +52,7 @@ def capture(
     scale: tuple[str, str, float] | None = None,
     minutes: float = 15.0,
     device: str = "cpu",
+    depth: tuple[str, str] | None = None,
     force: bool = False,
     say: Callable[[str], None] = print,
 ) -> dict:
@@ -55,6 +64,8 @@ def capture(
         board, scale: see :func:`gsim3d.capture.calibrate.calibrate`.
         minutes: time to train.
         device: "cpu" or "cuda".
+        depth: model and .safetensors file of a pretrained depth encoder, see
+            :class:`gsim3d.nn.multiview_encoder.config.ViTConfig`; None: plane sweep.
         force: go on where views do not overlap or a calibration does not fit.
         say: receives what was decided, and why.
 
@@ -62,40 +73,67 @@ def capture(
         The content of metrics.json.
 
     Raises:
-        InputError: films or cameras cannot be used; the message names angles or reprojection errors.
+        InputError: films or cameras cannot be used; the message names angles or reprojection errors. Or ``out`` was
+            started with other films or settings.
     """
     folder, out = Path(folder), Path(out)
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder")
     if out.exists() and not out.is_dir():
         raise InputError(f"--out: {out} is not a folder")
+    check_device(device)
+    if depth:
+        ViTConfig(depth[0])  # raises if there is no such model
+        if not Path(depth[1]).is_file():
+            raise InputError(f"--depth: {depth[1]}: no such file")
+        depth = depth[0], str(Path(depth[1]).resolve())
     out.mkdir(parents=True, exist_ok=True)
     with only_one_writer(out):
-        run = _Run(folder, out, device, minutes, force, say)
+        run = _Run(folder, out, device, minutes, depth, force, say)
+        run.check_same()
         run.calibrate(board, scale)
         run.step("check", run.check)
         proposal = run.step("propose", run.propose)
-        run.step("train", lambda: run.train(proposal))
-        scores = run.step("score", run.score)
-    say(f"view: gsim3d view {run.scenes('test')[0]} --checkpoint {out / 'model'}")
+        settings = run.step("settings", lambda: run.settings(proposal))
+        trained = run.step("train", lambda: run.train(settings))
+        scores = run.step("score", lambda: run.score(trained))
+    say(f"view: {shlex.join(['gsim3d', 'view', str(run.scenes('test')[0]), '--checkpoint', str(out / 'model')])}")
     return scores
 
 
+@dataclasses.dataclass
 class _Run:
-    def __init__(self, folder: Path, out: Path, device: str, minutes: float, force: bool, say: Callable[[str], None]):
-        self.folder, self.out, self.say = folder, out, say
-        self.device, self.minutes, self.force = device, minutes, force
+    folder: Path
+    out: Path
+    device: str
+    minutes: float
+    depth: tuple[str, str] | None
+    force: bool
+    say: Callable[[str], None]
+
+    def check_same(self) -> None:
+        """Raises InputError if the run folder belongs to other films or settings."""
+        depth = list(self.depth) if self.depth else None
+        given = {"DIR": str(self.folder.resolve()), "device": self.device, "minutes": self.minutes, "depth": depth}
+        file = self.out / "capture.json"
+        before = read_json(file) if file.is_file() else given
+        if changed := [key for key in given if before.get(key) != given[key]]:
+            was = ", ".join(f"{key} {before.get(key)}" for key in changed)
+            raise InputError(f"{self.out}: was started with {was}; give the same, or another --out")
+        write_whole(file, json.dumps(given, indent=1) + "\n")
 
     def step(self, name: str, compute: Callable[[], Any]) -> Any:
         """Returns the result of a step, read from its file if it exists, else computed and written."""
-        file = self.out / FILES[name]
+        file = self.out / f"{FILES[name]}.json"
         if file.is_file():
             self.say(f"{name}: done ({file})")
-            return json.loads(file.read_text())
+            return read_json(file)
         self.say(f"{name}:")
+        for later in list(FILES)[list(FILES).index(name) + 1 :]:
+            (self.out / f"{FILES[later]}.json").unlink(missing_ok=True)
         result = compute()
         write_whole(file, json.dumps(result, indent=1) + "\n")
-        return json.loads(file.read_text())
+        return read_json(file)
 
     def scenes(self, part: str) -> list[Path]:
         return find_scenes(self.out / "scenes" / part)
@@ -121,13 +159,15 @@ class _Run:
             problems += found.problems
             if found.scene is None:
                 raise InputError(found.problems[0])
+            extra = [film.name for film in films_in(path) if film.stem not in found.scene.camera_names]
+            problems += [f"{path / FILE}: has no camera of {', '.join(extra)}: calibrate again"] if extra else []
             if found.scene.cameras_move:
                 raise InputError(f"{path}: a capture needs cameras that do not move")
             if angles is None:
                 names = found.scene.camera_names
                 angles = check.angles(found.scene.recording.viewmats[0])
                 problems += [check.overlap_problem(names, angles)]
-                errors = check.match_errors(found.scene, angles)
+                errors = {} if found.problems else check.match_errors(found.scene, angles)
                 problems += [check.fit_problem(errors, found.scene.width)]
         problems = [problem for problem in problems if problem]
         nearest = np.where(np.eye(len(angles), dtype=bool), np.inf, angles).min(1)
@@ -149,10 +189,11 @@ class _Run:
         proposal = prepare.propose(takes, self.device, self.say)
         train, test = ([(take, range(take.n_steps)) for take in part] for part in split_scenes(takes))
         if not test:
-            take = takes[0]
-            end = take.n_steps - max(self._least_steps(), round(prepare.HELD_OUT_SHARE * take.n_steps))
-            if end < self._least_steps():
-                raise InputError(f"{take.path}: {take.n_steps} frames; at least {2 * self._least_steps()} are needed")
+            take, least = takes[0], prepare.HISTORY[self.device] + 2
+            end = take.n_steps - max(least, round(prepare.HELD_OUT_SHARE * take.n_steps))
+            if end < least:
+                have = f"{take.n_steps} common frames at {take.fps:g} a second"
+                raise InputError(f"{take.path}: {have}; at least {2 * least} are needed")
             train, test = [(take, range(end))], [(take, range(end, take.n_steps))]
             self.say(f"  held out: the last {take.n_steps - end} of {take.n_steps} frames")
         else:
@@ -161,39 +202,34 @@ class _Run:
         for part, chosen in (("train", train), ("test", test)):
             (scenes / part).mkdir(parents=True, exist_ok=True)
             for take, steps in chosen:
-                prepare.write_scene(take, proposal, steps, scenes / part / take.path.resolve().name)
+                below = take.path.resolve().relative_to(self.folder.resolve()).parts or (self.folder.resolve().name,)
+                prepare.write_scene(take, proposal, steps, scenes / part / "_".join(below))
         shutil.rmtree(cache)
         return dataclasses.asdict(proposal)
 
-    def _least_steps(self) -> int:
-        return prepare.HISTORY[self.device] + 2
-
-    def train(self, proposal: dict) -> dict:
-        """Trains the model; returns the settings."""
+    def settings(self, proposal: dict) -> dict:
+        """Returns the settings of a new training."""
+        shutil.rmtree(self.out / "model", ignore_errors=True)
         folders = self.scenes("train")
-        file = self.out / "settings.json"  # kept for a training that was interrupted
-        if file.is_file():
-            config = from_dict(TrainConfig, json.loads(file.read_text()))
-        else:
-            config = self._timed(self._config(proposal, folders), folders)
-            write_whole(file, json.dumps(to_dict(config), indent=1) + "\n")
-        train(config, folders, self.out / "model", device=self.device)
-        return to_dict(config)
+        return to_dict(self._timed(self._config(proposal, folders), folders))
 
     def _config(self, proposal: dict, folders: list[Path]) -> TrainConfig:
         history, device = prepare.HISTORY[self.device], self.device
         shortest = min(Scene.open(folder).n_steps for folder in folders)
         held_out = proposal["held_out_camera"]
         n_inputs = len(proposal["crops"]) - (held_out is not None)
-        phase = {"batch": BATCH[device], "warm_up": 0.1}
         horizons = sorted({min(horizon, shortest - history) for horizon, _, _ in PHASES})
+        rates = [rate * (DEPTH_RATE if self.depth else 1) for *_, rate in PHASES]
         phases = [
-            PhaseConfig(1, horizon, learning_rate=rate, **phase) for horizon, (_, _, rate) in zip(horizons, PHASES)
+            PhaseConfig(PROBED, h, learning_rate=r, batch=BATCH[device], warm_up=0.1) for h, r in zip(horizons, rates)
         ]
-        gpu = {"dynamics": {"drop_path": 0.0, "shuffle_orders": False}} if device == "cuda" else {}
+        model = {"dynamics": {"drop_path": 0.0, "shuffle_orders": False}} if device == "cuda" else {}
+        if self.depth:
+            model["encoder"] = {"backbone": "vit_dpt", "vit": {"model": self.depth[0]}}
         return TrainConfig(
             preset=prepare.PRESETS[device],
-            model=gpu,
+            model=model,
+            pretrained_depth=self.depth[1] if self.depth else "",
             phases=tuple(phases),
             data=DataConfig(
                 history=history,
@@ -211,12 +247,9 @@ class _Run:
     def _timed(self, config: TrainConfig, folders: list[Path]) -> TrainConfig:
         """Returns the configuration with as many steps as fit into the time to train."""
         scenes = [Scene.open(folder) for folder in folders]
-        probe = dataclasses.replace(
-            config, phases=tuple(dataclasses.replace(phase, steps=PROBED) for phase in config.phases)
-        )
         phases = []
         with tempfile.TemporaryDirectory() as temporary:
-            trainer = Trainer(probe, scenes, temporary, device=self.device)
+            trainer = Trainer(config, scenes, temporary, device=self.device)
             trainer.simulator.train()
             shares = np.array([share for _, share, _ in PHASES[: len(config.phases)]])
             for phase, share in zip(config.phases, shares / shares.sum(), strict=True):
@@ -230,29 +263,41 @@ class _Run:
                 phases.append(dataclasses.replace(phase, steps=steps))
         return dataclasses.replace(config, phases=tuple(phases))
 
-    def score(self) -> dict:
+    def train(self, settings: dict) -> dict:
+        """Trains the model, or continues; returns on what, how long and how many steps."""
+        config = from_dict(TrainConfig, settings)
+        train(config, self.scenes("train"), self.out / "model", device=self.device)
+        last = (self.out / "model" / LOG).read_text().splitlines()[-1]
+        minutes = json.loads(last)["machine"]["seconds"] / 60
+        machine = torch.cuda.get_device_name() if self.device == "cuda" else self.device
+        return {"device": machine, "minutes": round(minutes, 2), "steps": config.n_steps}
+
+    def score(self, trained: dict) -> dict:
         """Scores windows of the held-out steps against the constant baseline."""
-        restored, differences, values = restore(self.out / "model", self.device), [], {"model": [], "constant": []}
-        metric = "psnr_masked"
+        restored, metric = restore(self.out / "model", self.device), "psnr_masked"
+        values: dict[str, list[float]] = {"model": [], "constant": []}  # of each window
         for folder in self.scenes("test"):
             scene = restored.open_scene(folder)
             n_future = min(SCORED_STEPS, scene.n_steps - restored.n_encoded)
             starts = range(0, scene.n_steps - restored.n_encoded - n_future + 1, n_future)
-            for start in starts[: MOST_WINDOWS - len(differences)]:
+            for start in starts[: MOST_WINDOWS - len(values["model"])]:
                 window = {"start": start, "n_future": n_future, "metrics": [metric], "methods": ["constant"]}
                 scores = score_scene(restored, scene, **window)
-                means = {m: float(scores.values[m][metric][scores.n_encoded :].nanmean()) for m in values}
-                for method, value in means.items():
-                    values[method].append(value)
-                differences.append(means["model"] - means["constant"])
-        gain = float(np.mean(differences))
-        error = float(np.std(differences, ddof=1) / np.sqrt(len(differences))) if len(differences) > 1 else None
+                found = [float(scores.values[method][metric][scores.n_encoded :].nanmean()) for method in values]
+                for own, value in zip(values.values(), found, strict=True):
+                    own += [value] if np.isfinite(found).all() else []
+        if not values["model"]:
+            raise InputError(f"{self.out / 'scenes' / 'test'}: no moving body is visible; film longer, or more takes")
+        differences = np.subtract(*values.values())
+        gain, count = float(differences.mean()), len(differences)
+        error = float(np.std(differences, ddof=1) / np.sqrt(count)) if count > 1 else None
         means = {method: float(np.mean(own)) for method, own in values.items()}
         beats = error is not None and gain > 2 * error
-        verdict = "above" if beats else "not above"
         spread = "one window, no error" if error is None else f"+- {error:.2f}"
         self.say(
-            f"  masked PSNR of {len(differences)} held-out windows: model {means['model']:.2f} dB, constant "
-            f"{means['constant']:.2f} dB: {gain:+.2f} dB ({spread}), {verdict} constant by two standard errors"
+            f"  masked PSNR of {count} held-out windows: model {means['model']:.2f} dB, constant "
+            f"{means['constant']:.2f} dB: {gain:+.2f} dB ({spread}), {'' if beats else 'not '}above constant by two "
+            "standard errors"
         )
-        return {**means, "gain": gain, "standard_error": error, "windows": len(differences), "above_constant": beats}
+        result = {"gain": gain, "standard_error": error, "windows": count, "above_constant": beats}
+        return {**trained, **means, **result, "of_windows": values}

@@ -11,11 +11,12 @@ Steps, each of which prints what it decides and why, writes its result, and is s
   calibrate   cameras.json beside the films (gsim3d calibrate), unless there are cameras
   check       every file, angles between cameras, reprojection error of matched features     OUT/check.json
   propose     frame rate, crop, size, stride, depth range; prepared scenes in OUT/scenes     OUT/proposal.json
-  train       settings for --minutes, and the model in OUT/model                             OUT/train.json
+  settings    of the model and its training; steps that fit into --minutes                  OUT/settings.json
+  train       the model in OUT/model; an interrupted training continues                      OUT/train.json
   score       held-out steps against the constant baseline                                   OUT/metrics.json
 
 Refused unless --force: cameras further than 45 degrees from their nearest neighbour, and calibrations that do not fit.
-Delete a file in OUT to repeat its step.
+Delete a file in OUT to repeat its step and those below.
 
 examples:
   gsim3d capture films --board 7 5 0.04 --out runs/capture --device cuda
@@ -31,6 +32,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--out", metavar="OUT", required=True, help="run folder, created or continued")
     add_calibration(parser)
     add("--minutes", type=number(0, 1e5, above=True), default=15.0, help="time to train (default: 15)")
+    add(
+        "--depth",
+        nargs=2,
+        metavar=("MODEL", "FILE"),
+        help="pretrained depth: its encoder.vit.model and weights",
+    )
     add("--device", choices=("cpu", "cuda"), default="cpu", help="where to train (default: cpu)")
     add("--force", action="store_true", help="go on where the check refuses")
 
@@ -38,6 +45,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from gsim3d.capture.run import capture
 
-    options = {"minutes": args.minutes, "device": args.device, "force": args.force}
+    options = {"minutes": args.minutes, "device": args.device, "depth": args.depth, "force": args.force}
     capture(args.folder, args.out, **calibration_of(args), **options)
     return 0

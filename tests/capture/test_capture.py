@@ -1,16 +1,23 @@
 """The command capture: refusals with reasons, decisions, prepared scenes, skipped steps."""
 
 import json
+import shutil
 
 import cv2
 import numpy as np
 import pytest
+import torch
+from safetensors.torch import save_file
 
 from gsim3d.capture import check, prepare
 from gsim3d.capture.run import _Run
 from gsim3d.cli.main import main
 from gsim3d.data import Scene, find_scenes
 from gsim3d.data.masks import background_image, foreground
+from gsim3d.errors import InputError
+from gsim3d.nn.multiview_encoder import Encoder, EncoderConfig
+from gsim3d.nn.multiview_encoder.config import ViTConfig
+from gsim3d.train.restore import restore
 from tests.capture.made_films import rig, write_textured_films
 from tests.capture.made_takes import cameras_at, write_take
 
@@ -22,19 +29,84 @@ def run(tmp_path_factory):
     patch = pytest.MonkeyPatch()
     patch.setattr("gsim3d.capture.run.PROBED", 1)
     patch.setattr("gsim3d.capture.run.PHASES", ((0, 0.5, 2e-3), (2, 0.5, 1e-3)))
-    assert main(["capture", str(folder / "ball"), "--out", str(folder / "run"), "--minutes", "0.01"]) == 0
+    assert main(["capture", str(folder / "ball"), "--out", str(folder / "my run"), "--minutes", "0.01"]) == 0
     patch.undo()
-    return folder / "run"
+    return folder / "my run"
 
 
 def test_capture_ends_with_a_score_and_skips_what_is_done(run, capsys):
     scores = json.loads((run / "metrics.json").read_text())
     assert scores["windows"] >= 1 and np.isfinite(scores["gain"])
+    assert scores["steps"] == 2 and len(scores["of_windows"]["constant"]) == scores["windows"]
     before = (run / "model" / "metrics.jsonl").stat().st_mtime_ns
-    assert main(["capture", str(run.parent / "ball"), "--out", str(run)]) == 0
+    arguments = ["capture", str(run.parent / "ball"), "--out", str(run), "--minutes"]
+    assert main([*arguments, "0.01"]) == 0
     said = capsys.readouterr().out
-    assert all(f"{step}: done" in said for step in ("check", "propose", "train", "score"))
+    assert all(f"{step}: done" in said for step in ("check", "propose", "settings", "train", "score"))
+    assert f"gsim3d view '{run}/scenes/test/ball' --checkpoint '{run}/model'" in said
     assert (run / "model" / "metrics.jsonl").stat().st_mtime_ns == before
+    assert main([*arguments, "15"]) == 2
+    assert "was started with minutes 0.01; give the same, or another --out" in capsys.readouterr().err
+    assert main(["capture", str(run), "--out", str(run), "--minutes", "0.01"]) == 2
+    assert f"was started with DIR {run.parent / 'ball'}" in capsys.readouterr().err
+
+
+def test_a_step_whose_file_is_deleted_is_repeated_with_those_below(tmp_path):
+    steps, said = _Run(tmp_path, tmp_path, "cpu", 1.0, None, False, lambda _: None), []
+    for deleted, repeated in ((None, ["propose", "settings", "score"]), ("settings.json", ["settings", "score"])):
+        if deleted:
+            (tmp_path / deleted).unlink()
+        said.clear()
+        for name in ("propose", "settings", "score"):
+            steps.step(name, lambda name=name: said.append(name) or {})
+        assert said == repeated
+    (tmp_path / "model").mkdir()
+    with pytest.raises(InputError, match="scenes"):
+        steps.settings({})
+    assert not (tmp_path / "model").exists()  # a new training does not continue the old one
+
+
+def test_pretrained_depth_is_trained_on(run, tmp_path, monkeypatch, capsys):
+    encoder = Encoder(EncoderConfig(backbone="vit_dpt", vit=ViTConfig("tiny")))
+    weights = {name: value.contiguous() for name, value in encoder.depth.backbone.state_dict().items()}
+    save_file(weights, tmp_path / "tiny.safetensors")
+    monkeypatch.setattr("gsim3d.capture.run.PROBED", 1)
+    monkeypatch.setattr("gsim3d.capture.run.PHASES", ((0, 1.0, 2e-3),))
+    arguments = ["capture", str(run.parent / "ball"), "--out", str(tmp_path / "run"), "--minutes", "0.001", "--depth"]
+    assert main([*arguments, "tiny", str(tmp_path / "none.safetensors")]) == 2
+    assert "none.safetensors: no such file" in capsys.readouterr().err
+    assert main([*arguments, "tinny", str(tmp_path / "tiny.safetensors")]) == 2
+    assert "did you mean tiny?" in capsys.readouterr().err and not (tmp_path / "run").exists()
+    assert main([*arguments, "tiny", str(tmp_path / "tiny.safetensors")]) == 0
+    kept = restore(tmp_path / "run" / "model", "cpu").simulator.encoder.depth.backbone.state_dict()
+    assert torch.equal(kept["cls_token"], encoder.depth.backbone.cls_token)
+
+
+def test_takes_of_equal_names_stay_apart(tmp_path):
+    for body in ("ball", "box"):
+        write_take(tmp_path / "films" / body / "0000", n_frames=24)
+    run = _Run(tmp_path / "films", tmp_path / "run", "cpu", 1.0, None, False, lambda _: None)
+    run.propose()
+    assert [path.name for path in run.scenes("train")] == ["box_0000"]
+    assert [path.name for path in run.scenes("test")] == ["ball_0000"]
+
+
+def test_files_that_are_missing_are_named(tmp_path, capsys):
+    folder = write_take(tmp_path / "ball", n_frames=16)
+    arguments = ["capture", str(folder), "--out", str(tmp_path / "run")]
+    for name in ("left", "middle"):
+        (folder / "masks" / name).mkdir(parents=True)
+        for frame in range(16):
+            cv2.imwrite(str(folder / "masks" / name / f"{frame}.png"), np.full((96, 96), 255, np.uint8))
+    assert main(arguments) == 2
+    assert f"camera right has no images <number>.png or .jpg in {folder / 'masks' / 'right'}" in capsys.readouterr().err
+    shutil.rmtree(folder / "masks")
+    (folder / "right.avi").rename(folder / "extra.avi")
+    assert main(arguments) == 2
+    assert "camera right needs a folder right" in capsys.readouterr().err
+    shutil.copy(folder / "left.avi", folder / "right.avi")
+    assert main(arguments) == 2
+    assert "cameras.json: has no camera of extra.avi" in capsys.readouterr().err
 
 
 def test_prepared_scenes_are_cropped_and_synchronised_with_their_cameras(run):
@@ -91,7 +163,7 @@ def test_a_wrong_camera_is_refused_by_the_error_of_matches(tmp_path):
 def test_force_goes_on_and_keeps_what_was_ignored(tmp_path):
     write_take(tmp_path / "ball", (0, 60, 180), n_frames=16)
     said = []
-    checked = _Run(tmp_path / "ball", tmp_path, "cpu", 1.0, True, said.append).check()
+    checked = _Run(tmp_path / "ball", tmp_path, "cpu", 1.0, None, True, said.append).check()
     assert any("ignored, because of --force: the views do not overlap" in line for line in said)
     assert len(checked["ignored"]) == 1
 
