@@ -65,6 +65,10 @@ def evaluate(job: Job) -> None:
         raise InputError("--given: cannot be combined with a CHECKPOINT, whose history sets the input steps")
     if job.checkpoint is None and (job.resample or job.keep or job.trust or job.calibrate_trust):
         raise InputError("--resample, --keep, --trust and --calibrate-trust require a CHECKPOINT")
+    if job.calibrate_trust and (job.predictions or job.baselines or job.trust or other):
+        raise InputError(
+            "--calibrate-trust scores nothing: leave out --predictions, --baselines, --trust, --against"
+        )
     with joined(job.device) as processes:
         _evaluate(job, metrics, not_measured, other, processes)
 
@@ -77,7 +81,7 @@ def _evaluate(job: Job, metrics: tuple, not_measured: dict, against: dict | None
     fitted = [baseline(name, job.device) for name in job.baselines]
     others = [*(Predictions.open(given, job.data) for given in job.predictions), *fitted]
     if len({other.name for other in others}) != len(others):
-        raise InputError("--predictions: names must be unique; use NAME=DIR")
+        raise InputError("--predictions, --baselines: names must be unique; use NAME=DIR")
     out = _report_path(job, others)
     n_encoded = job.given if restored is None else restored.data.history
     scenes, conditions = _open_scenes(job, restored)

@@ -74,6 +74,7 @@ def calibrate(restored: Restored, scenes: Sequence[Scene], n_future: int) -> Tru
     """
     if len(scenes) < 2:
         raise InputError(f"trust: needs two or more scenes to calibrate; got {len(scenes)}")
+    restored.simulator.trust = None  # an older calibration announces nothing here
     found = fit_bounds(collect(restored, scenes, n_future))
     measured = []
     for scene in scenes:

@@ -113,6 +113,8 @@ def test_where_it_does_not_apply_it_says_why(data, quick, tmp_path, monkeypatch,
         with pytest.raises(InputError, match=r"[34] bodies \(a cloth is one\), and it simulates one"):
             method.check(scene, [2], 4, 4)
     out = tmp_path / "metrics.json"
+    with pytest.raises(InputError, match="--baselines: names must be unique"):
+        evaluate(Job(data=str(data), baselines=["spring-gaus"] * 2, given=4))
     job = Job(data=str(data), baselines=["spring-gaus"], given=4, steps=4, cameras=TARGETS, scenes="all", out=str(out))
     evaluate(job)
     assert "4 bodies" in json.loads(out.read_text())["not_applicable"]["spring-gaus"]

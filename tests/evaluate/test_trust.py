@@ -215,8 +215,16 @@ def test_commands(work, tmp_path, capsys):
     simulate = ["simulate", model, f"{data}/ball/0000", "--steps", "3", "--max-error", "0.000001", "--quiet"]
     assert main([*simulate, "--out", str(tmp_path / "a")]) == 2
     assert "errors are not calibrated" in (said := capsys.readouterr().err) and "--calibrate-trust" in said
-    assert main(["evaluate", model, data, "--scenes", "all", "--calibrate-trust"]) == 0
-    assert restore(model).simulator.trust.n_scenes == 3
+    calibrate = ["evaluate", model, data, "--scenes", "all", "--calibrate-trust"]
+    assert main([*calibrate, "--baselines", "spring-gaus"]) == 2
+    assert "--calibrate-trust scores nothing: leave out" in capsys.readouterr().err
+    assert main(calibrate) == 0
+    made = restore(model).simulator.trust
+    assert made.n_scenes == 3
+    calibration.save_trust(work, restore(model).checkpoint.digest, dataclasses.replace(made, threshold=1e-9))
+    capsys.readouterr()
+    assert main(calibrate) == 0 and "unlike the validation scenes" not in capsys.readouterr().err
+    assert restore(model).simulator.trust == made
     assert main([*simulate, "--out", str(tmp_path / "b")]) == 0
     assert "exceeds 1e-06 m from predicted step 1 on" in capsys.readouterr().out
     report = tmp_path / "report.json"
