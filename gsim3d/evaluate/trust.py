@@ -23,7 +23,7 @@ from gsim3d.state import DYNAMIC
 from gsim3d.train.restore import Restored
 
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
-BINS = 16  # of the scores, with equally many particles
+BINS = 16  # of the scores, with equally many particles where scores differ
 LEAST_ERROR = 1e-4  # metres, added to errors before their logarithm
 FALSE_ALARMS = 0.01  # share of the inputs of the calibration that are out of range
 LEAST_DEVIATION = 0.01, 1e-3  # of a measure, relative to its mean and in its unit: all rigs may be equal
@@ -103,7 +103,8 @@ def fit_bounds(pairs: Sequence[Samples]) -> dict:
             fits.append((((design @ solution - target) ** 2).sum(), tuple(powers)))
     powers = np.array(min(fits)[1])
     score = powers @ features
-    bins = np.array_split(np.argsort(score, kind="stable"), min(BINS, len(score)))
+    number = np.searchsorted(np.quantile(score, np.arange(1, BINS) / BINS), score, side="right")  # of equal scores one
+    bins = [number == n for n in np.unique(number)]
     quantiles = np.array([np.quantile(error[rows], LEVELS) for rows in bins])
     return {
         "spread_power": float(powers[0]),

@@ -138,6 +138,18 @@ def test_bounds_rise_and_hold_for_their_share():
         made.bound(rising, 0.77)
 
 
+def test_bounds_hold_where_scores_are_equal():
+    rng = np.random.default_rng(0)
+    spread, step = np.zeros((8, 500)), np.arange(1, 9)[:, None]
+    pairs = [
+        (spread, size * step * rng.exponential(size=spread.shape)) for size in (0.01, 0.1)
+    ]  # an easy, a hard scene
+    fields = calibration.fit_bounds(pairs)
+    assert list(fields["scores"]) == sorted(set(fields["scores"])) and len(fields["scores"]) == 8
+    found = calibration.report(made_trust(**fields), pairs)["reliability"]
+    assert all(share == pytest.approx(float(level), abs=0.005) for level, share in found.items())
+
+
 def test_powers_are_never_negative():
     rng = np.random.default_rng(0)
     spread = np.exp(rng.normal(-5, 1, (8, 500)))
