@@ -334,3 +334,30 @@ def test_benchmark_plans_in_a_model_from_images_of_the_truth(monkeypatch, capsys
     bench.show("model", found)
     assert found["solved"] == 0 and len(found["median_errors"]["model"]) == 8
     assert "solved 0 of 2 (95 %: 0% to 66%)" in capsys.readouterr().out
+
+
+def test_benchmark_goes_on_from_its_file(monkeypatch, capsys, tmp_path, model):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "tools" / "bench"))
+    bench = importlib.import_module("push_planning")
+    called, wanted = [], bench.run
+    episode = {"solved": True, "distance": 0.1, "steps": 3, "plan_seconds": [1.0], "errors": [[[0.01] * 8] * 2]}
+
+    def run(agent, env, seed, **options):
+        called.append((agent, seed))
+        if seed == 1002:
+            raise InputError("it broke")
+        return {"seed": seed, **episode}
+
+    monkeypatch.setattr(bench, "run", run)
+    given = ["--agents", "zero", "model", "--model", model, "--out", str(tmp_path / "out.json")]
+    with pytest.raises(InputError, match="it broke"):
+        bench.main([*given, "--seeds", "3"])
+    bench.main([*given, "--seeds", "2"])
+    assert called == [("zero", 1000), ("zero", 1001), ("zero", 1002), ("model", 1000), ("model", 1001)]
+    shown = capsys.readouterr().out
+    assert shown.count("solved 2 of 2 (95 %: 34% to 100%), last distance 0.100 m, 3 steps, 1.00 s a plan") == 2
+    monkeypatch.setattr(bench, "run", wanted)
+    for wrong, words in ((["--reach", "1"], "is of other settings"), (["--seeds", "0"], "--seeds must be at least 1")):
+        with pytest.raises(SystemExit):
+            bench.main([*given, *wrong])
+        assert words in capsys.readouterr().err

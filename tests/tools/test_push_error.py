@@ -38,9 +38,11 @@ def test_errors_of_a_simulator_that_moves_nothing_are_those_of_constant(tmp_path
     folders = generate(tmp_path / "data", "push", processes=1, progress=False, **OPTIONS).folders
     trainer = Trainer(CONFIG, [Scene.open(folder) for folder in folders], tmp_path / "run")
     trainer.save()
-    main([str(tmp_path / "run"), str(tmp_path / "data"), "--out", str(tmp_path / "errors.json")])
-    found = json.loads((tmp_path / "errors.json").read_text())
+    main([str(tmp_path / "run"), str(tmp_path / "data"), "--out", str(tmp_path / "new" / "errors.json")])
+    found = json.loads((tmp_path / "new" / "errors.json").read_text())
     assert len(found["scenes"]) == 2 and "2 scenes, 0 left out" in capsys.readouterr().out
+    both = sorted(errors["constant"] for errors in found["scenes"].values())
+    assert found["median"]["constant"] == pytest.approx([sum(both) / 2, *both])  # interval of two values
     for folder in folders:
         center = np.load(folder / "states.npz")["body_0"][:, 0]
         errors = found["scenes"][folder.relative_to(tmp_path / "data").as_posix()]

@@ -14,7 +14,6 @@ import argparse
 import json
 import math
 import os
-import statistics
 import sys
 import time
 from collections import deque
@@ -31,6 +30,8 @@ from gsim3d import Simulator  # noqa: E402
 from gsim3d.envs.model import ModelScenes, Start  # noqa: E402
 from gsim3d.envs.push import PushToGoal  # noqa: E402
 from gsim3d.envs.push_planning import GoalCost, ModelDynamics, TrueDynamics, action_bounds  # noqa: E402
+from gsim3d.io.files import write_whole  # noqa: E402
+from gsim3d.io.terminal import progress  # noqa: E402
 from gsim3d.planning import CEM, MPPI, Plan  # noqa: E402
 
 FIRST_SEED = 1000
@@ -47,9 +48,6 @@ class InTruth:
         self.planner = planner(
             self.dynamics, GoalCost(torch.from_numpy(task.goal)), *action_bounds(), seed=seed, **SETTINGS
         )
-
-    def observe(self) -> None:
-        """Sees the task after a step."""
 
     def plan(self, executed: int) -> Plan:
         return self.planner.plan(self.task.simulation.state(), executed)
@@ -117,21 +115,20 @@ def run(agent: str, env: gymnasium.Env, seed: int, **of_model) -> dict:
         for action in actions:
             _, reward, terminated, truncated, info = env.step(action)
             steps, ended = steps + 1, terminated or truncated
-            if planner is not None:
+            if agent == "model":
                 planner.observe()
             if ended:
                 break
-    errors = planner.errors if agent == "model" else []
     found = {"seed": seed, "solved": info["is_success"], "distance": -reward, "steps": steps}
-    return {**found, "plan_seconds": times, "errors": errors}
+    return {**found, "plan_seconds": times, "errors": getattr(planner, "errors", [])}
 
 
 def wilson(solved: int, count: int, z: float = 1.959964) -> tuple[float, float]:
     """The 95 % interval of a share."""
     share, spread = solved / count, z * z / count
-    middle = (share + spread / 2) / (1 + spread)
-    half = z / (1 + spread) * math.sqrt(share * (1 - share) / count + spread / (4 * count))
-    return max(0.0, middle - half), min(1.0, middle + half)
+    half = z * math.sqrt(share * (1 - share) / count + spread / (4 * count))
+    low, high = ((share + spread / 2 + sign * half) / (1 + spread) for sign in (-1, 1))
+    return max(0.0, low), min(1.0, high)
 
 
 def summary(episodes: list[dict]) -> dict:
@@ -146,12 +143,12 @@ def summary(episodes: list[dict]) -> dict:
         "solved": solved,
         "episodes": len(episodes),
         "interval": wilson(solved, len(episodes)),
-        "median_distance": statistics.median(episode["distance"] for episode in episodes),
-        "median_steps": statistics.median(steps) if steps else None,
-        "median_plan_seconds": statistics.median(times) if times else None,
-        "steps_a_second": predicted / statistics.median(times) if times else None,
+        "median_distance": np.median([episode["distance"] for episode in episodes]),
+        "median_steps": np.median(steps) if steps else None,
+        "median_plan_seconds": np.median(times) if times else None,
+        "steps_a_second": predicted / np.median(times) if times else None,
         "median_errors": dict(zip(("model", "rest"), middle, strict=False)),
-        "runs": [{k: v for k, v in one.items() if k not in ("plan_seconds", "errors")} for one in episodes],
+        "runs": episodes,
     }
 
 
@@ -169,7 +166,7 @@ def show(agent: str, found: dict) -> None:
     print(text, flush=True)
 
 
-def main() -> None:
+def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0], allow_abbrev=False)
     parser.add_argument("--agents", nargs="+", choices=("zero", "random", *PLANNERS), help="default: all that can run")
     parser.add_argument("--model", help="simulator of the agent model: a checkpoint, or a shipped name")
@@ -177,25 +174,37 @@ def main() -> None:
     parser.add_argument("--reach", type=float, help="metres around bodies and pusher of the background that is copied")
     parser.add_argument("--chunk", type=int, help="largest number of sequences that the simulator predicts together")
     parser.add_argument("--seeds", type=int, default=50, help="number of episodes (default %(default)s)")
-    parser.add_argument("--out", type=Path, help="file for all numbers")
-    args = parser.parse_args()
+    parser.add_argument("--out", type=Path, help="file for all numbers, written after each episode; goes on from it")
+    args = parser.parse_args(arguments)
     agents = args.agents or ["zero", "random", "mppi", "cem", *["model"] * (args.model is not None)]
     if "model" in agents and args.model is None:
         parser.error("the agent model needs --model PATH")
-    scenes = args.model and ModelScenes(Simulator.from_pretrained(args.model, device=args.device), 1, 1)
-    of_model = {"scenes": scenes, "reach": args.reach, "chunk": args.chunk}
-    env, found = gymnasium.make("gsim3d/PushToGoal-v0"), {}
+    if args.seeds < 1:
+        parser.error(f"--seeds must be at least 1; got {args.seeds}")
+    simulator = args.model and Simulator.from_pretrained(args.model, device=args.device).requires_grad_(False)
+    device = torch.cuda.get_device_name() if args.device == "cuda" else args.device
+    about = {"model": args.model, "device": device, "reach": args.reach}
+    about = {"task": "PushToGoal", "first_seed": FIRST_SEED, "every": EVERY, **SETTINGS, **about}
+    given = json.loads(args.out.read_bytes()) if args.out and args.out.exists() else {"about": about, "agents": {}}
+    if given.get("about") != about:
+        parser.error(f"--out: {args.out} is of other settings; name another file")
+    found = given["agents"]
+    of_model = {"scenes": args.model and ModelScenes(simulator, 1, 1), "reach": args.reach, "chunk": args.chunk}
+    env, seeds = gymnasium.make("gsim3d/PushToGoal-v0"), range(FIRST_SEED, FIRST_SEED + args.seeds)
     for agent in agents:
-        seeds = range(FIRST_SEED, FIRST_SEED + args.seeds)
-        found[agent] = summary([run(agent, env, seed, **of_model) for seed in seeds])
-        show(agent, found[agent])
-    if args.out:
-        about = {"task": "PushToGoal", "first_seed": FIRST_SEED, "every": EVERY, **SETTINGS}
-        if args.model:
-            device = torch.cuda.get_device_name() if args.device == "cuda" else args.device
-            about |= {"model": args.model, "device": device, "reach": args.reach}
-        args.out.write_text(json.dumps({"about": about, "agents": found}, indent=1) + "\n")
+        runs = {one["seed"]: one for one in found.get(agent, {}).get("runs", [])}
+        for seed in progress(seeds, agent, unit="episode"):
+            if seed in runs:
+                continue
+            runs[seed] = run(agent, env, seed, **of_model)
+            found[agent] = summary(list(runs.values()))
+            if args.out:
+                write_whole(args.out, json.dumps({"about": about, "agents": found}, indent=1) + "\n")
+        show(agent, summary([runs[seed] for seed in seeds]))
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except (ValueError, OSError) as error:
+        sys.exit(f"push_planning: error: {error}")

@@ -20,6 +20,7 @@ import os
 import sys
 import tempfile
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -50,15 +51,19 @@ def run(recipe, state: Path, out: Path, *, minutes: float, device: str, workers:
     from tools.release.trajectories import DataWorkers, TrajectoryStore
 
     world, name = recipe.stream(), recipe.name
-    with tempfile.TemporaryDirectory(prefix="release_") as scratch, joined(device) as together:
+    folder = tempfile.TemporaryDirectory(prefix="release_", ignore_cleanup_errors=True)
+    with folder as scratch, joined(device) as together, ExitStack() as ended:
         report = say if together.is_first else lambda _: None
         store = TrajectoryStore(world, recipe.capacity, device)
         first = load_progress(state, name).next_trajectory
         validation = Path(scratch) / "validation"
         maker = make_validation(recipe, validation) if together.is_first else None
+        for ends_it in (maker.join, maker.terminate) if maker else ():  # the last one first
+            ended.callback(ends_it)
         with DataWorkers(world, store, first, workers, scratch, together) as made:
             trainer = RunTrainer(recipe.train, store, Path(scratch) / "run", device, together)
             progress = load_into(trainer, state, name)
+            report(f"{name}: waits for {recipe.n_first} trajectories of {workers} data workers")
             if not made.wait_for(-(-recipe.n_first // together.count), end - time.monotonic()):
                 raise InputError(f"--minutes: {minutes:g} pass before {recipe.n_first} trajectories are made")
             if trainer.new_parameters:
