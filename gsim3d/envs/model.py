@@ -221,11 +221,12 @@ class ModelScenes(Scenes):
 
     def centers(self) -> Tensor:
         points, weights = self.points().double(), self._members / self._members.sum(-1, keepdim=True).clamp_min(1)
-        before, after = weights @ self._rest, weights @ points
+        before, after = _product(weights, self._rest), _product(weights, points)
         arms = points[:, None] - after[:, :, None], self._rest[:, None] - before[:, :, None]
-        u, _, vh = torch.linalg.svd(torch.einsum("nbp,nbpi,nbpj->nbij", weights, *arms))
-        u = torch.cat([u[..., :2], u[..., 2:] * torch.linalg.det(u @ vh)[..., None, None]], -1)  # no mirroring
-        return after + ((u @ vh) @ (self._centers - before)[..., None])[..., 0]
+        u, _, vh = torch.linalg.svd(_product(weights[:, :, None] * arms[0].mT, arms[1]))
+        mirrored = torch.linalg.det(_product(u, vh))[..., None, None]
+        turn = _product(torch.cat([u[..., :2], u[..., 2:] * mirrored], -1), vh)
+        return after + _product(turn, (self._centers - before)[..., None])[..., 0]
 
     def points(self) -> Tensor:
         newest = last_steps(self.state.particles, 1)
@@ -302,17 +303,16 @@ class ModelScenes(Scenes):
         n_bodies, means = start.scene.n_bodies, last_steps(self.state.particles, 1)
         share = -(-N_PARTICLES // n_bodies)
         means = means.means[means.cu_rows[number] : means.cu_rows[number + 1]]
-        rows, members, middles = [], [], []
+        rows, middles = [], []
         for body in range(n_bodies):
             known = (labels == body).nonzero()[:, 0]
             if not len(known):
                 raise InputError(f"body {body} of scene {number} is not seen by any camera; reset with another seed")
             rows.append(known[torch.from_numpy(rng.integers(len(known), size=share)).to(self.device)])
-            members += [body] * share
             middles.append((means[known].amin(0) + means[known].amax(0)) / 2)
         self._rows[number] = torch.cat(rows)[:N_PARTICLES]
         self._rest[number] = means[self._rows[number]].double()
-        of_points = torch.tensor(members[:N_PARTICLES], device=self.device)
+        of_points = torch.arange(N_PARTICLES, device=self.device) // share
         self._members[number] = of_points == torch.arange(self.most_bodies, device=self.device)[:, None]
         centers = torch.stack(middles).double() if start.centers is None else torch.from_numpy(start.centers)
         self._centers[number, :n_bodies], self._centers[number, n_bodies:] = centers.to(self.device), torch.nan
@@ -324,6 +324,11 @@ class SharedContext(FrozenContext):
     def readers(self, pyramid: Pyramid, particles: Particles) -> list[Reader]:
         first = torch.zeros_like(particles.cloud_scene)
         return super().readers(pyramid, dataclasses.replace(particles, cloud_scene=first))
+
+
+def _product(a: Tensor, b: Tensor) -> Tensor:
+    """Matrix products whose bits do not depend on the size of the batch."""
+    return (a[..., None] * b[..., None, :, :]).sum(-2)
 
 
 def _tiled(particles: Particles, count: int) -> Particles:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.envs.model import ModelScenes, ModelState
-from gsim3d.envs.push import MAX_SPEED, PushToGoal, bounded_velocity
+from gsim3d.envs.push import PushToGoal, bounded_velocity
 from gsim3d.synth.cameras import Rig
 from gsim3d.synth.pushing import PUSHER_RADIUS, SIZE, PushSimulation
 from gsim3d.synth.scene_setup import Unstable
@@ -93,9 +93,3 @@ class GoalCost:
         behind = states.centers + BEHIND * away / distance.clamp_min(1e-6)[..., None]
         approach = (states.pusher - behind).norm(dim=-1).mean(-1)
         return distance.mean(-1) + FINAL * distance[:, -1] + APPROACH * approach
-
-
-def action_bounds() -> tuple[Tensor, Tensor]:
-    """Lowest and highest action [2], m/s, float64."""
-    high = torch.full((2,), MAX_SPEED, dtype=torch.float64)
-    return -high, high

@@ -130,10 +130,9 @@ class TrueScenes(Scenes):
         return torch.from_numpy(np.stack([scene.actors for scene in self.all]))
 
     def centers(self) -> Tensor:
-        found = torch.full((len(self.all), self.most_bodies, 3), torch.nan, dtype=torch.float64)
-        for scene, centers in zip(self.all, found, strict=True):
-            centers[: scene.n_bodies] = torch.from_numpy(scene.centers)
-        return found
+        absent = [((0, self.most_bodies - scene.n_bodies), (0, 0)) for scene in self.all]
+        centers = [np.pad(scene.centers, pad, constant_values=np.nan) for scene, pad in zip(self.all, absent)]
+        return torch.from_numpy(np.stack(centers))
 
     def points(self) -> Tensor:
         return torch.from_numpy(np.stack([scene.points() for scene in self.all]).astype(np.float32))

@@ -210,12 +210,10 @@ class Episodes:
         """
         if self.executed is None:
             raise InputError("step was called before reset")
-        shape = (self.count, len(self._high))
-        if actions.shape != shape or not bool((actions.abs() <= self._high + 1e-6).all()):
+        if actions.shape != (self.count, len(self._high)) or not bool((actions.abs() <= self._high + 1e-6).all()):
             bounds = ", ".join(f"{high:g}" for high in self.task.max_action)
-            raise InputError(
-                f"action must be {shape[1]} numbers of at most {bounds} in absolute value; got {actions.tolist()}"
-            )
+            wanted = f"{len(self._high)} numbers of at most {bounds} in absolute value"
+            raise InputError(f"action must be {wanted}; got {shown(actions.tolist())}")
         self.executed = self.task.act(self.scenes, actions)
         self._measure()
 
@@ -276,10 +274,10 @@ class TaskVectorEnv(VectorEnv):
         for name, value in (("num_envs", num_envs), ("max_episode_steps", max_episode_steps)):
             if value is not None and (not isinstance(value, Integral) or value < 1):
                 raise InputError(f"{name} must be a whole number of at least 1; got {value!r}")
-        autoreset_mode = getattr(autoreset_mode, "value", autoreset_mode)
-        check_one_of("autoreset_mode", autoreset_mode, [mode.value for mode in AutoresetMode])
+        mode = getattr(autoreset_mode, "value", autoreset_mode)
+        check_one_of("autoreset_mode", mode, [known.value for known in AutoresetMode])
         self._episodes = Episodes(self.task, num_envs, **options)
-        self.mode, self.num_envs = AutoresetMode(autoreset_mode), num_envs
+        self.mode, self.num_envs = AutoresetMode(mode), num_envs
         self._torch = not isinstance(self._episodes.scenes, TrueScenes)
         self.metadata = {**self.task.metadata, "torch": self._torch, "autoreset_mode": self.mode}
         self.render_mode, self._most_steps = options.get("render_mode"), max_episode_steps

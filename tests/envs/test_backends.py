@@ -25,7 +25,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics  # noqa: E402
 from gsim3d.envs import ThrowToTarget  # noqa: E402
 from gsim3d.envs.model import ModelScenes, Start  # noqa: E402
 from gsim3d.envs.push import FPS, MAX_SPEED, PushClear, PushToGoal  # noqa: E402
-from gsim3d.envs.push_planning import GoalCost, ModelDynamics, action_bounds  # noqa: E402
+from gsim3d.envs.push_planning import GoalCost, ModelDynamics  # noqa: E402
 from gsim3d.envs.scenes import task_rig  # noqa: E402
 from gsim3d.planning import GradientDescent  # noqa: E402
 from gsim3d.planning.costs import image_distance  # noqa: E402
@@ -222,6 +222,9 @@ def test_copies_of_a_scene_predict_what_it_does(background):
     given = actions(6, 1).unflatten(0, (3, 2))
     states = ModelDynamics(scenes)(scenes.state, given)
     start = scenes.state
+    apart = [ModelDynamics(scenes)(start, chunk) for chunk in (given[:1], given[1:])]
+    assert torch.equal(torch.cat([one.centers for one in apart]), states.centers)
+    assert torch.equal(torch.cat([one.points for one in apart]), states.points)
     copies = scenes.repeated(start, 3).state.particles
     n_frozen = (copies.activity == FROZEN).sum()
     newest = last_steps(start.particles, 1).activity == FROZEN
@@ -257,7 +260,9 @@ def test_gradients_of_costs_of_particles_and_images_reach_actions(types):
         ends = [cost(dynamics(start, (given + sign * 1e-3 * along).detach()), given) for sign in (1, -1)]
         slope = float(ends[0] - ends[1]) / 2e-3  # orders of particles jump beyond
         assert found.abs().min() > 0 and float(found.norm()) == pytest.approx(slope, rel=0.2), name
-    planner = GradientDescent(dynamics, costs["image"], *action_bounds(), horizon=2, samples=1, iterations=4)
+    planner = GradientDescent(
+        dynamics, costs["image"], np.full(2, -0.5), np.full(2, 0.5), horizon=2, samples=1, iterations=4
+    )
     history = planner.plan(start).history
     assert len(history) == 4 and history[-1] < float(costs["image"](dynamics(start, torch.zeros(1, 2, 2)), None))
 

@@ -17,7 +17,7 @@ pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'gsim3d[envs]'")
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 from gsim3d.envs.push import FPS, MAX_SPEED, N_PARTICLES, REACHED, WORKSPACE, PushClear, PushToGoal  # noqa: E402
-from gsim3d.envs.push_planning import GoalCost, TrueDynamics, action_bounds  # noqa: E402
+from gsim3d.envs.push_planning import GoalCost, TrueDynamics  # noqa: E402
 
 TASKS = ("PushToGoal", "PushClear")
 
@@ -221,8 +221,8 @@ def test_a_planner_in_the_truth_solves_an_episode():
     _, info = env.reset(seed=1)
     task = env.unwrapped
     planner = MPPI(
-        TrueDynamics(task.simulation), GoalCost(torch.from_numpy(task.goal)), *action_bounds(),
-        horizon=8, samples=32, iterations=2, noise=0.3,
+        TrueDynamics(task.simulation), GoalCost(torch.from_numpy(task.goal)),
+        env.action_space.low, env.action_space.high, horizon=8, samples=32, iterations=2, noise=0.3,
     )  # fmt: skip
     executed, terminated = 0, False
     while not terminated:

@@ -28,13 +28,13 @@ import torch  # noqa: E402
 import gsim3d.envs  # noqa: E402, F401
 from gsim3d import Simulator  # noqa: E402
 from gsim3d.envs.model import ModelScenes, Start  # noqa: E402
-from gsim3d.envs.push import PushToGoal  # noqa: E402
-from gsim3d.envs.push_planning import GoalCost, ModelDynamics, TrueDynamics, action_bounds  # noqa: E402
+from gsim3d.envs.push import MAX_SPEED, PushToGoal  # noqa: E402
+from gsim3d.envs.push_planning import GoalCost, ModelDynamics, TrueDynamics  # noqa: E402
 from gsim3d.io.files import write_whole  # noqa: E402
 from gsim3d.io.terminal import progress  # noqa: E402
 from gsim3d.planning import CEM, MPPI, Plan  # noqa: E402
 
-FIRST_SEED = 1000
+FIRST_SEED, FASTEST = 1000, torch.full((2,), MAX_SPEED, dtype=torch.float64)
 EVERY = 4  # steps between plans
 PLANNERS = {"mppi": MPPI, "cem": CEM, "model": MPPI}
 SETTINGS = {"horizon": 8, "samples": 64, "iterations": 3, "noise": 0.3}
@@ -46,7 +46,7 @@ class InTruth:
     def __init__(self, planner: type, task: PushToGoal, seed: int):
         self.task, self.dynamics = task, TrueDynamics(task.simulation)
         self.planner = planner(
-            self.dynamics, GoalCost(torch.from_numpy(task.goal)), *action_bounds(), seed=seed, **SETTINGS
+            self.dynamics, GoalCost(torch.from_numpy(task.goal)), -FASTEST, FASTEST, seed=seed, **SETTINGS
         )
 
     def plan(self, executed: int) -> Plan:
@@ -63,7 +63,7 @@ class InModel:
     def __init__(self, task: PushToGoal, seed: int, scenes: ModelScenes, reach: float | None, chunk: int | None):
         self.task, self.scenes, self.seed, self.errors = task, scenes, seed, []
         self.dynamics, cost = ModelDynamics(scenes, reach), GoalCost(torch.from_numpy(task.goal).to(scenes.device))
-        self.planner = MPPI(self.dynamics, cost, *action_bounds(), seed=seed, chunk=chunk, **SETTINGS)
+        self.planner = MPPI(self.dynamics, cost, -FASTEST, FASTEST, seed=seed, chunk=chunk, **SETTINGS)
         first = (task.scenes.all[0].view(scenes.rig), task.scenes.all[0].actors)
         self.seen = deque([first] * scenes.history, maxlen=scenes.history)  # at rest before the start
 
