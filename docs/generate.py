@@ -8,9 +8,12 @@ import inspect
 import json
 import re
 from pathlib import Path
+from statistics import mean, stdev
 
 DOCS = Path(__file__).parent
 ROOT, RESULTS = DOCS.parent, DOCS / "results"
+CAPTURES_HEAD = ("films", "encoder", "machine", "minutes", "steps", "windows")
+CAPTURES_HEAD += ("masked PSNR dB", "constant dB", "above constant", "above plane sweep")
 COST_HEAD = ("#", "setting", "kind", "step ms", "p95", "encode ms", "faster", "agreement dB", "masked PSNR dB", "kept")
 
 
@@ -27,6 +30,7 @@ def write_pages(folder: Path) -> None:
         "stability": stability(),
         "settings": settings(),
         "trust": trust(),
+        "captures": captures(RESULTS / "captures"),
         "notebook": notebook(ROOT / "examples" / "predict_look_edit_score.ipynb"),
         **{f"model_{name}": model(name) for name in model_names()},
         **{f"cost_{name}": cost(name) for name in model_names()},
@@ -193,6 +197,33 @@ def training_steps() -> str:
 def stability() -> str:
     """Every hard case, constant and guard."""
     return _tool("stability").page(json.loads((RESULTS / "stability.json").read_text()))
+
+
+def captures(folder: Path) -> str:
+    """Scores of the films of generated scenes, of the runs of tools/capture_films.sh."""
+    found = {tuple(file.stem.split("-")): json.loads(file.read_text()) for file in sorted(folder.glob("*-*.json"))}
+    if not found:
+        return "Not measured yet.\n"
+    windows = {run: scores["of_windows"] for run, scores in found.items()}
+    for encoder in sorted({encoder for _, encoder in windows}):
+        runs = [own for (_, other), own in windows.items() if other == encoder]
+        windows["all", encoder] = {method: sum((run[method] for run in runs), []) for method in ("model", "constant")}
+
+    def apart(a: list[float], b: list[float]) -> str:
+        differences = [x - y for x, y in zip(a, b, strict=True)]
+        error = f" ± {stdev(differences) / len(a) ** 0.5:.2f}" if len(a) > 1 else ""
+        return f"{mean(differences):+.2f}{error}"
+
+    rows = []
+    for (films, encoder), own in windows.items():
+        run, sweep = found.get((films, encoder), {}), windows.get((films, "plane_sweep"))
+        is_paired = encoder != "plane_sweep" and sweep and sweep["constant"] == own["constant"]  # of the same windows
+        rows.append(
+            (films.replace("_", " "), encoder, *(run.get(key, "") for key in ("device", "minutes", "steps")))
+            + (len(own["model"]), f"{mean(own['model']):.2f}", f"{mean(own['constant']):.2f}")
+            + (apart(own["model"], own["constant"]), apart(own["model"], sweep["model"]) if is_paired else "")
+        )
+    return table(CAPTURES_HEAD, rows)
 
 
 def trust() -> str:

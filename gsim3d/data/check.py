@@ -143,8 +143,8 @@ def describe(scene: Scene) -> str:
     labels = "subtracted" if scene.recording.subtract_background else "yes" if scene.has_segmentation() else "none"
     offset = ", ".join(f"{x:.0f}" for x in scene.world_offset) if scene.world_offset.any() else None
     where = "" if offset is None else f", world offset ({offset})"
-    actions = scene.recording.actions
-    actors = "" if actions is None else f", actors: {', '.join(dict.fromkeys(actions.types))}"
+    names = [*dict.fromkeys(scene.recording.actions.types)] if scene.has_actions() else []
+    actors = f", actors: {', '.join(names[:3])}" + f", ... ({len(names)})" * (len(names) > 3) if names else ""
     return (
         f"{scene.name}: {scene.layout}, {scene.n_steps} steps at {scene.fps:g} fps, "
         f"{scene.n_cams} cameras{moves}, "
