@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 
 from gsim3d.capture.films import Film
-from gsim3d.data.recording import evenly_spaced
 from gsim3d.errors import InputError, did_you_mean
 
 MAX_VIEWS = 60  # times at which the board is searched
@@ -103,6 +102,14 @@ def calibrate_board(films: Sequence[Film], offsets: Sequence[float], board: Boar
     ]
 
 
+def calm_times(times: np.ndarray, films: Sequence[Film], offsets: Sequence[float]) -> np.ndarray:
+    """Returns at most MAX_VIEWS of ``times``: in each part that of least motion, since shutters are not synchronous."""
+    own = [film.video.times + offset for film, offset in zip(films, offsets, strict=True)]
+    speed = sum(np.interp(times, (at[1:] + at[:-1]) / 2, film.motion) for at, film in zip(own, films, strict=True))
+    parts = np.array_split(np.arange(len(times)), min(len(times), MAX_VIEWS))
+    return times[[part[speed[part].argmin()] for part in parts]]
+
+
 def _detect(films: Sequence[Film], offsets: Sequence[float], board: Board) -> list[dict[int, tuple]]:
     """Returns (object points, pixels) of the board by time, for each camera."""
     made = board.made()
@@ -113,7 +120,7 @@ def _detect(films: Sequence[Film], offsets: Sequence[float], board: Board) -> li
         raise InputError(f"{films[0].video.what}: the films of the board have no time in common")
     times, every = films[0].video.times + offsets[0], []
     times = times[(times >= low - 1e-6) & (times <= high + 1e-6)]
-    times = times[evenly_spaced(len(times), MAX_VIEWS)]
+    times = calm_times(times, films, offsets)
     for film, offset in zip(films, offsets, strict=True):
         numbers, found = film.nearest(times - offset), {}
         for frame, image in enumerate(film.grey(numbers)):

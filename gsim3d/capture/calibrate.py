@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gsim3d.capture.board import Board, Calibrated, calibrate_board
-from gsim3d.capture.films import BOARD, MIN_AGREEMENT, Film, films_in, motion, takes_of, time_offsets
+from gsim3d.capture.films import BOARD, MIN_AGREEMENT, Film, films_in, takes_of, time_offsets
 from gsim3d.capture.sfm import calibrate_sfm
 from gsim3d.data.videos import FILE, SAME_RATE
 from gsim3d.errors import InputError
@@ -62,8 +62,8 @@ def calibrate(
     if bad and not force:
         errors = ", ".join(f"{c.name} {c.error:.2f} px (at most {MAX_ERROR * c.size[0]:.2f})" for c in bad)
         raise InputError(
-            f"{folder}: the calibration does not fit: reprojection error of {errors}; film the board again, sharper "
-            "and closer, with cameras that do not move (--force goes on)"
+            f"{folder}: the calibration does not fit: reprojection error of {errors}; film the board again, sharper, "
+            "closer and with pauses, by cameras that do not move (--force goes on)"
         )
     cameras = _scaled(cameras, scale, board is not None, say)
     written = []
@@ -81,7 +81,7 @@ def calibrate(
 
 
 def _offsets(films: Sequence[Film], say: Callable[[str], None]) -> tuple[np.ndarray, np.ndarray]:
-    offsets, agreement = time_offsets([film.video.times for film in films], [motion(film) for film in films])
+    offsets, agreement = time_offsets([film.video.times for film in films], [film.motion for film in films])
     for film, offset, own in zip(films, offsets, agreement, strict=True):
         why = f"motion correlates by {own:.2f}"
         if own < MIN_AGREEMENT:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -57,6 +58,24 @@ class Film:
         own = self.video.times
         return np.searchsorted((own[1:] + own[:-1]) / 2, times).tolist()
 
+    @cached_property
+    def motion(self) -> np.ndarray:
+        """Returns [N - 1], the root mean squared difference between consecutive frames.
+
+        Where a frame was dropped and the one before is shown again, the motion of the next one is spread over both.
+        """
+        width, height = self.size
+        small = MOTION_WIDTH, max(1, round(height * MOTION_WIDTH / width))
+        images = (cv2.resize(image, small, interpolation=cv2.INTER_AREA) for image in self.grey(self.video.numbers))
+        pairs = itertools.pairwise(image.astype(np.float32) for image in images)
+        found = [float(np.sqrt(np.square(image - before).mean())) for before, image in pairs]
+        begin, limit = 0, REPEATED * np.median(found)
+        for end, change in enumerate(found):
+            if change >= limit:
+                found[begin : end + 1] = [change / (end + 1 - begin)] * (end + 1 - begin)
+                begin = end + 1
+        return np.array(found)
+
 
 def takes_of(folder: Path) -> dict[Path, list[Path]]:
     """Returns the films of each take: those in ``folder``, or else those of each of its subfolders.
@@ -88,27 +107,6 @@ def films_in(folder: Path) -> list[Path]:
     return sorted(films, key=lambda file: natural_order(file.name))
 
 
-def motion(film: Film) -> np.ndarray:
-    """Returns [N - 1], the root mean squared difference between consecutive frames.
-
-    Where a frame was dropped and the one before is shown again, the motion of the next one is spread over both.
-    """
-    width, height = film.size
-    small = MOTION_WIDTH, max(1, round(height * MOTION_WIDTH / width))
-    before, found = None, []
-    for image in film.grey(film.video.numbers):
-        image = cv2.resize(image, small, interpolation=cv2.INTER_AREA).astype(np.float32)
-        if before is not None:
-            found.append(float(np.sqrt(np.square(image - before).mean())))
-        before = image
-    begin, limit = 0, REPEATED * np.median(found or [0])
-    for end, change in enumerate(found):
-        if change >= limit:
-            found[begin : end + 1] = [change / (end + 1 - begin)] * (end + 1 - begin)
-            begin = end + 1
-    return np.array(found)
-
-
 def time_offsets(times: Sequence[np.ndarray], motions: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Aligns films by the motion that they show.
 
@@ -118,7 +116,7 @@ def time_offsets(times: Sequence[np.ndarray], motions: Sequence[np.ndarray]) -> 
 
     Args:
         times: seconds of the frames of each of V films.
-        motions: :func:`motion` of each film.
+        motions: :attr:`Film.motion` of each film.
 
     Returns:
         Offsets [V] in seconds to add to the times of each film, that of the first is 0; and the best correlation [V]

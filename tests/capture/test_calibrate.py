@@ -2,12 +2,13 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
-from gsim3d.capture.board import Board
+from gsim3d.capture.board import Board, calm_times
 from gsim3d.capture.calibrate import _common_rate, calibrate
 from gsim3d.capture.films import Film, takes_of, time_offsets
 from gsim3d.cli.main import main
@@ -107,6 +108,18 @@ def test_offsets_of_motion_are_found_within_a_fraction_of_a_frame():
     offsets, agreement = time_offsets(times, motions)
     np.testing.assert_allclose(offsets, starts, atol=0.01)
     assert agreement.min() > 0.9
+
+
+def test_a_board_is_searched_where_it_pauses():
+    times, moves = np.arange(900) / 30, np.sin(2 * np.pi * np.arange(899) / 45) ** 2
+    films = [
+        SimpleNamespace(video=SimpleNamespace(times=times), motion=moved) for moved in (moves, 3 * np.roll(moves, 15))
+    ]
+    chosen = calm_times(times[30:870], films, [0.0, -0.5])
+    assert 50 < len(chosen) <= 60 and (np.diff(chosen) > 0).all()
+    speed = np.interp(chosen, (times[1:] + times[:-1]) / 2, moves)
+    assert speed.mean() < 0.15 and moves.mean() > 0.45
+    assert (calm_times(times[:7], films, [0.0, -0.5]) == times[:7]).all()
 
 
 def test_short_films_are_not_aligned_by_a_few_frames_that_agree():
