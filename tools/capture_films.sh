@@ -4,7 +4,8 @@
 # An interrupted call continues: `timeout 540 bash tools/capture_films.sh ...` until the table is printed.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-out=${1:-runs/films} device=${2:-cpu} minutes=${3:-15} weights=${4:-} scenes=${5:-24} results=${6:-docs/results/captures}
+out=${1:-runs/films} device=${2:-cpu} minutes=${3:-15} weights=${4:-}
+scenes=${5:-24} results=${6:-docs/results/captures}
 films=("elastic elastic 0 1 2" "rigid rigid 0 1 2" "cloth cloth 0 1 2" "held_out_camera elastic 0 1 2 3")
 
 film() { # NAME WORLD CAMERA ...
@@ -16,7 +17,8 @@ film() { # NAME WORLD CAMERA ...
 
 capture() { # NAME ENCODER [--depth MODEL FILE]
   local run="$out/$1/$2"
-  python -m gsim3d capture "$out/$1/films" --board 5 4 0.25 --out "$run" --device "$device" --minutes "$minutes" "${@:3}"
+  python -m gsim3d capture "$out/$1/films" --board 5 4 0.25 --out "$run" --device "$device" --minutes "$minutes" \
+    "${@:3}"
   cp "$run/metrics.json" "$results/$1-$2.json"
 }
 
@@ -31,4 +33,8 @@ for words in "${films[@]}"; do
   cp -rln "$out/$name/plane_sweep/"{scenes,check.json,proposal.json} "$out/$name/dinov2_small" # prepared alike
   capture "$name" dinov2_small --depth dinov2_small "$weights"
 done
-python -c "import sys; sys.path.insert(0, 'docs'); import generate, pathlib; print(generate.captures(pathlib.Path('$results')))"
+python -c "
+import pathlib, sys
+sys.path.insert(0, 'docs')
+import generate
+print(generate.captures(pathlib.Path('$results')))"
