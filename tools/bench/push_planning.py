@@ -27,7 +27,7 @@ import torch  # noqa: E402
 
 import gsim3d.envs  # noqa: E402, F401
 from gsim3d import Simulator  # noqa: E402
-from gsim3d.envs.model import ModelScenes, Start  # noqa: E402
+from gsim3d.envs.model import ModelScenes, ModelState, Start  # noqa: E402
 from gsim3d.envs.push import MAX_SPEED, PushToGoal  # noqa: E402
 from gsim3d.envs.push_planning import GoalCost, ModelDynamics, TrueDynamics  # noqa: E402
 from gsim3d.io.files import write_whole  # noqa: E402
@@ -38,19 +38,6 @@ FIRST_SEED, FASTEST = 1000, torch.full((2,), MAX_SPEED, dtype=torch.float64)
 EVERY = 4  # steps between plans
 PLANNERS = {"mppi": MPPI, "cem": CEM, "model": MPPI}
 SETTINGS = {"horizon": 8, "samples": 64, "iterations": 3, "noise": 0.3}
-
-
-class InTruth:
-    """Plans in MuJoCo."""
-
-    def __init__(self, planner: type, task: PushToGoal, seed: int):
-        self.task, self.dynamics = task, TrueDynamics(task.simulation)
-        self.planner = planner(
-            self.dynamics, GoalCost(torch.from_numpy(task.goal)), -FASTEST, FASTEST, seed=seed, **SETTINGS
-        )
-
-    def plan(self, executed: int) -> Plan:
-        return self.planner.plan(self.task.simulation.state(), executed)
 
 
 class InModel:
@@ -72,11 +59,12 @@ class InModel:
         truth = self.task.scenes.all[0]
         self.seen.append((truth.view(self.scenes.rig), truth.actors))
 
-    def plan(self, executed: int) -> Plan:
+    def state(self) -> ModelState:
+        """What the planner begins with, encoded from the last images."""
         views, actors = zip(*self.seen, strict=True)
         start = Start(views, np.stack(actors), self.task.scenes.all[0])
         self.scenes.encode({0: start}, {0: np.random.default_rng(self.seed)})
-        return self.planner.plan(self.scenes.state, executed)
+        return self.scenes.state
 
     def compare(self, plan: Plan) -> None:
         """Adds the errors of a plan."""
@@ -93,34 +81,33 @@ def run(agent: str, env: gymnasium.Env, seed: int, **of_model) -> dict:
     ``of_model``: ``scenes``, ``reach`` and ``chunk`` of :class:`InModel`.
     """
     _, info = env.reset(seed=seed)
-    task, rng, times, planner = env.unwrapped, np.random.default_rng(seed), [], None
-    if agent == "model":
-        planner = InModel(task, seed, **of_model)
-    elif agent in PLANNERS:
-        planner = InTruth(PLANNERS[agent], task, seed)
+    task, rng, times = env.unwrapped, np.random.default_rng(seed), []
+    model = InModel(task, seed, **of_model) if agent == "model" else None
+    if agent in PLANNERS:
+        dynamics, cost = TrueDynamics(task.simulation), GoalCost(torch.from_numpy(task.goal))
+        planner = model.planner if model else PLANNERS[agent](dynamics, cost, -FASTEST, FASTEST, seed=seed, **SETTINGS)
     ended, steps, reward, actions = False, 0, 0.0, []
     while not ended:
         if agent == "zero":
             actions = [np.zeros(2, np.float32)]
         elif agent == "random":
-            low, high = env.action_space.low, env.action_space.high
-            actions = [rng.uniform(low, high).astype(np.float32)]
+            actions = [rng.uniform(-MAX_SPEED, MAX_SPEED, 2).astype(np.float32)]
         else:
             start = time.perf_counter()
-            plan = planner.plan(len(actions))
+            plan = planner.plan(model.state() if model else task.simulation.state(), len(actions))
             times.append(time.perf_counter() - start)
-            if agent == "model":
-                planner.compare(plan)
+            if model:
+                model.compare(plan)
             actions = list(plan.actions[:EVERY].numpy().astype(np.float32))
         for action in actions:
             _, reward, terminated, truncated, info = env.step(action)
             steps, ended = steps + 1, terminated or truncated
-            if agent == "model":
-                planner.observe()
+            if model:
+                model.observe()
             if ended:
                 break
     found = {"seed": seed, "solved": info["is_success"], "distance": -reward, "steps": steps}
-    return {**found, "plan_seconds": times, "errors": getattr(planner, "errors", [])}
+    return {**found, "plan_seconds": times, "errors": model.errors if model else []}
 
 
 def wilson(solved: int, count: int, z: float = 1.959964) -> tuple[float, float]:
