@@ -184,3 +184,17 @@ def test_bad_options(capsys, work, tmp_path, arguments, message):
     errors = capsys.readouterr().err
     assert message in errors and errors.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_a_shipped_simulator_in_three_minutes(tmp_path):
+    options = ["--worlds", "elastic", "--trajectories", "1", "--steps", "4", "--budget", "3"]
+    assert main(["reproduce", "--out", str(tmp_path), *options]) == 0
+    content = json.loads((tmp_path / "reproduce.json").read_text())
+    lines = {(line["table"], line["row"]): line["numbers"] for line in content["lines"]}
+    assert all("needs --device cuda" in line or NO_TIME in line for line in content["missing"]), content["missing"]
+    model, still = lines[MAIN, "elastic-small"], lines[MAIN, "constant"]
+    assert model["future.psnr_body"] > still["future.psnr_body"] + 2 and model["step_ms"] > 0
+    cell = json.loads(next((tmp_path / "cells" / "Main-table").rglob("*.json")).read_text())["result"]["scores"]
+    fall = {name: values["momentum"] for name, values in cell["physics"].items()}  # of free fall
+    assert fall["model"] == pytest.approx(fall["truth"], rel=0.1) and fall["truth"][-1] > fall["truth"][0] > 0.5
