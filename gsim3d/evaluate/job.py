@@ -66,7 +66,7 @@ def evaluate(job: Job) -> None:
     if job.checkpoint is None and (job.resample or job.keep or job.trust or job.calibrate_trust):
         raise InputError("--resample, --keep, --trust and --calibrate-trust require a CHECKPOINT")
     if job.calibrate_trust and (job.predictions or job.baselines or job.trust or other):
-        raise InputError("--calibrate-trust scores nothing: leave out --predictions, --baselines, --trust, --against")
+        raise InputError("--calibrate-trust cannot be combined with --predictions, --baselines, --trust or --against")
     with joined(job.device) as processes:
         _evaluate(job, metrics, not_measured, other, processes)
 

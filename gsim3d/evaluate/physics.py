@@ -41,7 +41,7 @@ MEASURES = {
 
 
 def measure(
-    points: Tensor, bodies: Tensor, fps: float, bounds: Tensor | None = None, ground: float | None = 0.0
+    points: Tensor, bodies: Tensor, fps: float, bounds: Tensor, ground: float | None = 0.0
 ) -> dict[str, Tensor]:
     """Returns each measure of MEASURES at every step after the first, float64 [S - 1].
 
@@ -49,7 +49,7 @@ def measure(
         points: [S, N, 3] metres, in correspondence over the steps; z is up.
         bodies: int64 [N], the body of each point.
         fps: steps per second.
-        bounds: [2, 3] metres; None: all of space.
+        bounds: [2, 3] metres, lowest and highest corner.
         ground: its height in metres; None: there is none, and penetration is NaN.
 
     Raises:
@@ -60,10 +60,8 @@ def measure(
         raise InputError(f"measure: points must be [S >= 2, N >= 1, 3]; got {list(points.shape)}")
     velocities = points.diff(dim=0) * fps
     later, heights = points[1:], points[..., 2].mean(1)
-    inside = torch.ones_like(later[..., 0])
-    if bounds is not None:
-        low, high = bounds.double()
-        inside = ((later >= low - MARGIN) & (later <= high + MARGIN)).all(-1).double()
+    low, high = bounds.double()
+    inside = ((later >= low - MARGIN) & (later <= high + MARGIN)).all(-1).double()
     return {
         "momentum": velocities.mean(1).norm(dim=1),
         "energy": velocities.square().sum(-1).mean(1) / 2 + GRAVITY * (heights[1:] + heights[:-1]) / 2,

@@ -303,7 +303,7 @@ def score_scene(
     valid = None if valid is None else valid.to(device)
     truth = SceneTruth(scene.name, images, labels, valid, n_encoded, metrics)
 
-    tracks: dict[str, Tensor] = {}
+    fits, tracks = [other for other in others if hasattr(other, "found")], {}
 
     def predicted() -> Iterator[tuple[str, Tensor]]:
         baselines: dict[str, Callable[[], Tensor]] = {
@@ -324,7 +324,7 @@ def score_scene(
             theirs = other.images(scene, cams, n_given, n_future).to(device).float() / 255
             if scene.recording.real_background and labels is not None:  # the true images are masked, too
                 theirs *= (labels[n_encoded:] != BACKGROUND)[..., None]
-            if hasattr(other, "points"):
+            if other in fits:
                 tracks[other.name] = other.points(scene, cams, n_given, n_future)
             yield other.name, theirs
         yield from ((name, make()) for name, make in baselines.items() if name in methods)
@@ -332,15 +332,15 @@ def score_scene(
     scores = truth.score(predicted())
     alone = [
         (f"{other.name}{ALONE}", other.object_images(scene, cams, n_given, n_future).to(device).float() / 255)
-        for other in others
-        if hasattr(other, "object_images")
+        for other in fits
     ]
     if alone:  # against the object on black
         objects, own = images * (labels == MOVING)[..., None], [m for m in metrics if m not in (*NEEDS_LABELS, "fvd")]
         truth = SceneTruth(scene.name, objects, labels, valid, n_encoded, own)
         scores.values.update(truth.score(alone).values)
     physics = measure_tracks(tracks, scene, range(n_given - 1, n_given + n_future))
-    return dataclasses.replace(scores, digest=digest, physics=physics)
+    fitted = {other.name: other.found() for other in fits}
+    return dataclasses.replace(scores, digest=digest, physics=physics, fitted=fitted)
 
 
 def _tracks(prediction: Prediction) -> dict[str, Tensor]:

@@ -134,7 +134,7 @@ def _of_scene(scores: SceneScores, missing: dict) -> dict:
     """Aggregates the scores of one scene over steps, see :func:`summarize`."""
     first, late = scores.n_encoded, (scores.n_encoded + scores.n_steps) // 2
     parts = {"past": slice(first), "future": slice(first, None), "future_late": slice(late, None)}
-    found = {"digest": scores.digest} if scores.digest else {}
+    found = {name: value for name, value in (("digest", scores.digest), ("fitted", scores.fitted)) if value}
     if scores.body_share is not None:
         found["body_share"] = mean_of_counted(scores.body_share)
     for method, metrics in scores.values.items():

@@ -63,6 +63,7 @@ class SceneScores:
     digest: str = ""  #: hash of the true images and labels
     #: method (and ``"truth"``) -> measure of :mod:`gsim3d.evaluate.physics` -> float64 [S - n_encoded]
     physics: dict[str, dict[str, Tensor]] = field(default_factory=dict)
+    fitted: dict[str, dict] = field(default_factory=dict)  #: method that is fitted to the scene -> what it found
 
 
 def ring_around_bodies(labels: Tensor) -> Tensor:

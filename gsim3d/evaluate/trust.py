@@ -50,11 +50,9 @@ def samples(scene: Scene, prediction: Prediction) -> Samples | None:
 def collect(restored: Restored, scenes: Sequence[Scene], n_future: int) -> list[Samples]:
     """Predicts scenes with their spread; returns the samples of those with known motion. Raises InputError if there is
     none."""
-    found = []
-    for scene in progress(list(scenes), "trust", unit="scene"):
-        made = samples(scene, predict_together(restored, [scene], n_future, with_spread=True)[0])
-        found += [] if made is None else [made]
-    if not found:
+    shown = progress(list(scenes), "trust", unit="scene")
+    made = [samples(one, predict_together(restored, [one], n_future, with_spread=True)[0]) for one in shown]
+    if not (found := [pair for pair in made if pair is not None]):
         raise InputError("trust: needs generated scenes, with states.npz and moving bodies")
     return found
 

@@ -113,7 +113,7 @@ def fit(case: Case, name: str) -> dict:
     other.check(scene, case.targets, GIVEN, n_future)
     given = {"target_cams": case.targets, "n_encoded": GIVEN, "n_future": n_future, "metrics": measurable()[0]}
     scores = score_scene(None, scene, **given, methods=(), others=[other])
-    return {"scores": to_json(scores, GIVEN), "found": other.found()}
+    return {"scores": to_json(scores, GIVEN)}
 
 
 def speed(case: Case) -> dict:

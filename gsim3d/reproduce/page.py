@@ -33,6 +33,7 @@ COLUMNS = {  # key of the numbers -> title, decimals
     "step_ms": ("ms a step", 2),
     "steps_a_second": ("steps a second", 1),
     "parameters": ("parameters", 0),
+    "substeps": ("substeps a frame", 0),
     "shape_cm": ("shape, cm", 2),
     "copies_cm": ("shape of copies, cm", 2),
     "fall": ("fall over free fall", 3),
@@ -137,6 +138,8 @@ def _numbers(cells: dict[str, dict], method: str) -> tuple[dict, dict, dict]:
         return first["numbers"], first.get("by_scene", {"": first["numbers"].get("step_ms")}), {}
     own = {scene: result["scores"] for scene, result in results.items()}
     summary = summarize([from_json({**scores, "scene": scene}, method or "model") for scene, scores in own.items()])
+    if found := [fit["substeps"] for scene in summary["scenes"].values() for fit in scene.get("fitted", {}).values()]:
+        summary["substeps"] = statistics.fmean(found)
     head = "psnr_masked" if "future.psnr_masked" in summary else "psnr"
     by_scene = {scene: scores.get(f"future.{head}") for scene, scores in summary["scenes"].items()}
     by_scene = {} if method.endswith(ALONE) else by_scene  # the others are of whole images

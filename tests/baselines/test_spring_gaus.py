@@ -94,6 +94,8 @@ def test_evaluate_scores_baselines_without_a_checkpoint(data, quick, tmp_path):
     report = json.loads(out.read_text())
     energy = {name: values["energy"] for name, values in report["physics"].items()}
     assert list(energy) == ["truth", "spring-gaus"] and energy["truth"] == pytest.approx(energy["spring-gaus"], rel=0.2)
+    (found,) = [scene["fitted"]["spring-gaus"] for scene in report["scenes"].values()]
+    assert found["substeps"] >= 5 and len(found["velocity"]) == 3 and found["stiffness"] > 0
     assert report["not_applicable"] == {} and "spring-gaus" in report["predictions"]
     assert report["spring-gaus.future.psnr"] > 18 and report["spring-gaus-object.future.psnr"] > 12
     assert "spring-gaus-object.future.psnr_body" not in report and report["fitted"]["spring-gaus"]["anchors"] == 64

@@ -25,6 +25,7 @@ from tests.data.made_scenes import edit_json
 from tests.tiny_scenes import write_scene
 
 ONE = torch.zeros(20, dtype=torch.int64)
+SPACE = torch.tensor([[-math.inf], [math.inf]]).expand(2, 3)
 
 
 def cloud(seed=0, n=20):
@@ -36,7 +37,7 @@ def test_free_fall_keeps_its_energy():
     times = torch.arange(12).double()[:, None, None] / fps
     down = torch.tensor([0.0, 0.0, 1.0]).double()
     points = cloud() + 5 * down + torch.tensor([0.3, 0.0, 0.0]) * times - 0.5 * 9.81 * times**2 * down
-    found = measure(points, ONE, fps)
+    found = measure(points, ONE, fps, SPACE)
     assert (found["energy"] / found["energy"][0] - 1).abs().max() < 1e-12
     assert found["momentum"][-1].item() == pytest.approx(math.hypot(0.3, 9.81 * 10.5 / fps), rel=1e-9)
     assert found["rigidity"].max() < 1e-9 and found["penetration"].max() == 0 and (found["permanence"] == 1).all()
@@ -48,13 +49,13 @@ def test_rigidity_is_of_each_body():
     turn = torch.tensor([[angle.cos(), -angle.sin(), 0], [angle.sin(), angle.cos(), 0], [0, 0, 1]]).double()
     points = torch.stack([torch.cat([first, second]), torch.cat([first @ turn.T + 1, second])])
     bodies = torch.arange(40) // 20
-    assert measure(points, bodies, 1.0)["rigidity"].item() < 1e-12
-    assert measure(points, bodies * 0, 1.0)["rigidity"].item() > 0.1
+    assert measure(points, bodies, 1.0, SPACE)["rigidity"].item() < 1e-12
+    assert measure(points, bodies * 0, 1.0, SPACE)["rigidity"].item() > 0.1
     mirrored = torch.stack([first, first * torch.tensor([-1.0, 1, 1])])
-    assert measure(mirrored, ONE, 1.0)["rigidity"].item() > 0.1
+    assert measure(mirrored, ONE, 1.0, SPACE)["rigidity"].item() > 0.1
     stretched = torch.stack([first, first.mean(0) + 1.1 * (first - first.mean(0))])
     size = (first - first.mean(0)).square().sum(-1).mean().sqrt().item()
-    assert measure(stretched, ONE, 1.0)["rigidity"].item() == pytest.approx(0.1 * size, rel=1e-9)
+    assert measure(stretched, ONE, 1.0, SPACE)["rigidity"].item() == pytest.approx(0.1 * size, rel=1e-9)
 
 
 def test_penetration_and_permanence():
@@ -63,9 +64,9 @@ def test_penetration_and_permanence():
     points[1, 5:10] = 9.0
     found = measure(points, ONE, 1.0, torch.tensor([[0.0, 0, 0], [1, 1, 1]]))
     assert found["penetration"].item() == pytest.approx(0.05) and found["permanence"].item() == pytest.approx(0.75)
-    raised = measure(points, ONE, 1.0, ground=0.25)["penetration"].item()
+    raised = measure(points, ONE, 1.0, SPACE, ground=0.25)["penetration"].item()
     assert raised == pytest.approx((0.25 - points[1, :, 2]).clamp_min(0).mean().item()) and raised > 0.11
-    assert measure(points, ONE, 1.0, ground=None)["penetration"].isnan().all()
+    assert measure(points, ONE, 1.0, SPACE, ground=None)["penetration"].isnan().all()
 
 
 def test_the_shape_of_the_worst_copy():
@@ -91,7 +92,7 @@ def test_a_free_body_falls_freely():
 
 def test_points_without_steps_are_refused():
     with pytest.raises(InputError, match="points must be"):
-        measure(torch.zeros(1, 20, 3), ONE, 1.0)
+        measure(torch.zeros(1, 20, 3), ONE, 1.0, SPACE)
 
 
 def test_particles_at_rest_do_not_count():
