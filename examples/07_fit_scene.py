@@ -78,7 +78,7 @@ class Splats:
             "means": points, "quats": torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1), "colors": torch.zeros(n, 3),
             "scales": third_neighbour(points).log().repeat(1, 3), "opacities": torch.full((n,), -2.0),
         }  # fmt: skip
-        self.rows = {name: value.to(device).requires_grad_() for name, value in start.items()}
+        self.rows = {name: value.to(device).clone().requires_grad_() for name, value in start.items()}
         rates = {name: rate * QUICK * (extent if name == "means" else 1) for name, rate in RATES.items()}
         groups = [{"params": [self.rows[name]], "lr": rate, "name": name} for name, rate in rates.items()]
         self.adam = torch.optim.Adam(groups, eps=1e-15)

@@ -80,6 +80,8 @@ class EncoderConfig:
     dynamic_dim: int = 32  #: channels of the latents that change with time
     static_dim: int = 32  #: channels of those that do not
     condition_dim: int = 20  #: hidden channels of the network that scales and shifts features by depth and viewing ray
+    #: largest root mean square of the latents of a particle, longer ones are scaled down; None: unlimited
+    latent_limit: float | None = None
     explicit: bool = False  #: also predict rotation, scale and spherical harmonics of each particle
     sh_degree: int = 3  #: degree of these harmonics
     #: smallest and largest predicted scale, in tenths of a pixel's width plus height at its depth
@@ -107,7 +109,7 @@ class EncoderConfig:
         check_ranges(self, **dict.fromkeys(("cnn_blocks", "transformer_layers"), (0, 100)), window_split=(1, 1000))
         check_ranges(self, **dict.fromkeys(("cost_unet_attention", "refine_unet_attention"), (1, 10**4)))
         check_ranges(self, cost_unet_levels=(1, 20), refine_unet_levels=(1, 20), transformer_mlp_ratio=(1, 100))
-        check_ranges(self, scale_range=(0, 1e6))
+        check_ranges(self, scale_range=(0, 1e6), latent_limit=(1e-3, 1e6))
         if self.scale_range[0] > self.scale_range[1]:
             raise InputError(f"EncoderConfig: scale_range must rise; got {self.scale_range}")
 

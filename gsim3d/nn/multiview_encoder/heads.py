@@ -110,7 +110,8 @@ class ParticleHeads(nn.Module):
         central = geometry.directions(height, width, raw_offset.new_zeros(1, 2, height, width))
         rays = pluecker(centers, central)
         features = self.conditioning(depth.features, depth.depth, depth.opacity_logit, raw_offset, rays)
-        return _rows(widened(self.to_latents(features)))
+        latents = _rows(widened(self.to_latents(features)))
+        return latents if self.config.latent_limit is None else _within(latents, self.config.latent_limit)
 
     def _rays(self, geometry: PixelRays, raw_offset: Tensor) -> Tensor:
         return geometry.directions(*raw_offset.shape[-2:], raw_offset.sigmoid() - 0.5)
@@ -136,6 +137,11 @@ class ParticleHeads(nn.Module):
     def rotate_harmonics(self, sh: Tensor, rotations: Tensor) -> Tensor:
         """Predicted coefficients [N, K, C] turned into the world by ``rotations`` [N, 3, 3]."""
         return rotate_harmonics(sh, rotations)
+
+
+def _within(latents: Tensor, limit: float) -> Tensor:
+    """Rows [..., C], scaled down to a root mean square of ``limit`` where it is larger."""
+    return latents * (limit**2 / latents.square().mean(-1, keepdim=True).clamp_min(limit**2)).sqrt()
 
 
 def _rows(maps: Tensor) -> Tensor:

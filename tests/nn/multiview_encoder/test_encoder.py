@@ -33,6 +33,23 @@ def test_any_number_of_views(n_views):
     assert all(getattr(particles, name).isfinite().all() for name in ROW_FIELDS)
 
 
+def test_latents_within_a_limit():
+    """Longer ones keep their direction; the others keep their bits; zeros have a gradient."""
+    free, limited = make_encoder(), make_encoder(latent_limit=0.4)
+    limited.load_state_dict(free.state_dict())
+    latents, scaled = free(make_frames([0, 0])).latents, limited(make_frames([0, 0])).latents
+    size = latents.square().mean(1).sqrt()
+    assert 0.05 < (size > 0.4).float().mean() < 0.95
+    assert_same_bits(scaled[size < 0.4], latents[size < 0.4])
+    assert_close_relative_to_max(scaled, latents * (0.4 / size).clamp_max(1)[:, None], 1e-6)
+    for module in (limited.heads.to_latents.weight, limited.heads.to_latents.bias):
+        torch.nn.init.zeros_(module)
+    limited(make_frames([0, 0])).latents.sum().backward()
+    assert limited.heads.to_latents.bias.grad.abs().min() > 0
+    with pytest.raises(InputError, match="latent_limit must be at least"):
+        EncoderConfig(latent_limit=0.0)
+
+
 def test_particles_lie_on_the_rays_of_their_pixels_between_near_and_far():
     """The principal point is far from the centre, so an encoder that ignores it fails."""
     frames = make_frames([0, 0, 0])
