@@ -39,9 +39,10 @@ def sweep_geometry(
     """
     if not torch.compiler.is_compiling():
         _check_geometry(Ks, viewmats, src_images, cu_src, Ks_target)
-    own = torch.repeat_interleave(
-        torch.arange(Ks.shape[0], device=Ks.device), cu_src[1:] - cu_src[:-1], output_size=src_images.shape[0]
-    )
+    # Lists that are not checked, on a GPU, must not index beyond the ends.
+    places = torch.arange(src_images.shape[0], device=Ks.device)
+    own = torch.searchsorted(cu_src[1:], places, right=True).clamp(max=Ks.shape[0] - 1)
+    src_images = src_images.clamp(0, Ks.shape[0] - 1)
     intrinsics, poses = Ks.double(), viewmats.double()
     target = intrinsics[src_images] if Ks_target is None else Ks_target.double()
     half_pixel = torch.eye(3, dtype=torch.float64, device=Ks.device)

@@ -21,6 +21,7 @@ from gsim3d.ops import (
     pool_max,
     pool_mean,
     row_scenes,
+    sweep_geometry,
     unpool,
 )
 from tests.asserts import gradients
@@ -273,6 +274,16 @@ def test_plane_sweep(indices, offsets, dtype, devices):
     unseen = blind & ~is_named(torch.cat(sources), 6)
     assert not cost[blind].any() and not grad[unseen].any()
     assert torch.equal(cost, plane_sweep(features, *geometry))
+
+
+@pytest.mark.parametrize("offsets", OFFSETS)
+@pytest.mark.parametrize("indices", INDICES)
+def test_sweep_geometry(indices, offsets, devices):
+    Ks, viewmats = torch.eye(3).expand(3, 3, 3), torch.eye(4).expand(3, 4, 4)
+    sources, cu = torch.tensor([1, 2, 0, 2, 1]), torch.tensor([0, 2, 4, 5])
+    rows = [x.to(devices[1]) for x in (Ks, viewmats, INDICES[indices](sources), OFFSETS[offsets](cu))]
+    homographies, translations = sweep_geometry(*rows)
+    assert torch.equal(homographies.cpu(), torch.eye(3).expand(5, 3, 3)) and not translations.any()
 
 
 def test_patch_attention_without_patches(devices):

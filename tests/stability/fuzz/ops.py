@@ -503,17 +503,26 @@ def _make(name: str, rng: random.Random, folder: Path) -> Arguments:
 
 def _call(name: str, arguments: Arguments, folder: Path) -> None:
     """Forward and backward; both must be finite where no error comes."""
-    _call_with(name, arguments, True)
+    _call_with(name, arguments, finite)
 
 
 def _call_on_gpu(name: str, arguments: Arguments, folder: Path) -> None:
     """The same on a GPU, where numbers and index lists are not checked: of those that the CPU refuses a result may be
     anything, but images, which leave such rows out."""
-    must_be_finite = name == "rasterize_gaussians" or _cpu_takes(name, arguments)
-    moved = {k: v.to("cuda") if isinstance(v, Tensor) and not v.is_meta else v for k, v in arguments.items()}
+
+    def check(value: Any, what: str = "result") -> None:
+        try:
+            finite(value, what)
+        except Failure:
+            if name == "rasterize_gaussians" or _cpu_takes(name, arguments):
+                raise
+
     try:
-        _call_with(name, moved, must_be_finite)
-        torch.cuda.synchronize()
+        moved = {k: v.to("cuda") if isinstance(v, Tensor) and not v.is_meta else v for k, v in arguments.items()}
+        try:
+            _call_with(name, moved, check)
+        finally:
+            torch.cuda.synchronize()
     except RuntimeError as error:
         if "CUDA error" in str(error):  # the device can no longer be used by this process
             print(str(error).splitlines()[0], file=sys.stderr, flush=True)
@@ -523,20 +532,19 @@ def _call_on_gpu(name: str, arguments: Arguments, folder: Path) -> None:
 
 def _cpu_takes(name: str, arguments: Arguments) -> bool:
     try:
-        OPS[name][1](arguments)
+        _result(name, dict(arguments))
     except EXPECTED:
         return False
     return True
 
 
-def _call_with(name: str, arguments: Arguments, must_be_finite: bool) -> None:
+def _call_with(name: str, arguments: Arguments, check: Callable[..., None]) -> None:
     leaves = {}
     for argument, value in arguments.items():
         is_leaf = isinstance(value, Tensor) and value.is_floating_point() and value.layout == torch.strided
         leaves[argument] = value.detach().requires_grad_() if is_leaf else value
     result = _result(name, leaves)
-    if must_be_finite:
-        finite(result)
+    check(result)
     outputs = [t for t in _tensors(result) if t.requires_grad and not t.is_meta]
     if not outputs:
         return
@@ -546,8 +554,7 @@ def _call_with(name: str, arguments: Arguments, must_be_finite: bool) -> None:
     grads = torch.autograd.grad(outputs, list(inputs.values()), cotangents, allow_unused=True)
     for (argument, value), grad in zip(inputs.items(), grads, strict=True):
         if grad is not None:
-            if must_be_finite:
-                finite(grad, f"gradient of {argument}")
+            check(grad, f"gradient of {argument}")
             if grad.shape != value.shape:
                 raise Failure(f"gradient of {argument} has shape {list(grad.shape)}, not {list(value.shape)}")
 
