@@ -9,8 +9,6 @@ capacity (:class:`gsim3d.ops.PyramidCapacity`), which is observed in a first rol
 particles exceed it, a flag read after the replay reports this, and the rollout is captured again with more capacity.
 """
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import dataclasses

@@ -1,7 +1,5 @@
 """Typed errors, which the command line reports in one line with exit code 2, and shared checks."""
 
-from __future__ import annotations
-
 import difflib
 import platform
 from collections.abc import Iterable, Iterator

@@ -1,7 +1,5 @@
 """Presets of model sizes: functions that return a ModelConfig."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from gsim3d.dynamics import DynamicsConfig

@@ -4,8 +4,6 @@ Source: Zhong et al. 2024, "Reconstruction and Simulation of Elastic Objects wit
 and published program differ, the program is followed.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import NamedTuple

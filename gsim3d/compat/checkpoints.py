@@ -1,7 +1,5 @@
 """Conversion of configurations and weights of older checkpoints to this version."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -4,8 +4,6 @@ The signature, shapes and conventions of gsplat 1.6.0's ``rasterization`` for 3D
 with equal bits from run to run.
 """
 
-from __future__ import annotations
-
 import math
 import weakref
 from collections.abc import Sequence

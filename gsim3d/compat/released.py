@@ -4,8 +4,6 @@ Besides names, two things differ: gsim3d predicts all latents with one convoluti
 explicit particles in the standard basis, so the first and last layer of the dynamics absorb a change of basis.
 """
 
-from __future__ import annotations
-
 import re
 
 import torch

@@ -4,8 +4,6 @@ Sizes are taken from the shapes of the weights where possible; the rest (strides
 comes from the file.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Rotation of spherical harmonics as in the published model."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn import functional as F

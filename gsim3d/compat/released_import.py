@@ -1,7 +1,5 @@
 """Import of published checkpoints (``gsim3d import``), with validation of every tensor."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from pathlib import Path

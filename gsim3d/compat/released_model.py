@@ -4,8 +4,6 @@ Each override reproduces one behaviour of the release that :mod:`gsim3d` correct
 the others. :func:`as_released` changes the classes of the modules of a network, so that names of weights stay the same.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Collection

@@ -9,8 +9,6 @@ of its learned embedding e and its displacement d to the next step, which is kno
 network predicts for action particles is not used.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor, nn
 

@@ -1,7 +1,5 @@
 """Configuration of the dynamics."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

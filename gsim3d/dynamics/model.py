@@ -1,7 +1,5 @@
 """The dynamics: predicts the next steps of particles from their last steps."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import math

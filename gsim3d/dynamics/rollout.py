@@ -1,7 +1,5 @@
 """Autoregressive rollouts."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from gsim3d.dynamics.frozen_context import FrozenContext

@@ -13,8 +13,6 @@ sleeping scene by more than ``eps`` a step. With ``eps=0`` it is 0: the network 
 its history and changed nothing.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 

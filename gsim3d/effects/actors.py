@@ -8,8 +8,6 @@ positions are shifted by the difference, and its velocity is replaced. After the
 replaced, too. Appearance and opacity are predicted.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -8,8 +8,6 @@ An operation changes all steps of the history, so that a moved body keeps its ve
 step of the history, so a box must contain the body in all of them.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from abc import abstractmethod

@@ -1,7 +1,5 @@
 """Plans: what a simulator computes for a spec, and the predicted cost."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Selections of particles by kind and position, for edits and for ``frozen_appearance``."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import ClassVar

@@ -1,7 +1,5 @@
 """One frame of Gaussians as numpy arrays, with the quantisation and the axes that the formats share."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path

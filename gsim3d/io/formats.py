@@ -1,7 +1,5 @@
 """All formats by suffix."""
 
-from __future__ import annotations
-
 import dataclasses
 import warnings
 from collections.abc import Callable, Sequence

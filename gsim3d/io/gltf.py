@@ -3,8 +3,6 @@
 Positions keep their axes; the node turns z up to glTF's y up, so that no number is changed.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Iterator

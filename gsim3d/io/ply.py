@@ -5,8 +5,6 @@ One vertex a Gaussian, float32: x y z (float64 where they have a ``world_offset`
 (w, x, y, z).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import re
 import warnings

@@ -4,8 +4,6 @@ Attributes that never change are written once. Frames in a row with as many Gaus
 that never change, without time samples, and one of the others. Fields of other frames are invisible.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Real spherical harmonics of view-dependent colour: basis, damping, rotation."""
 
-from __future__ import annotations
-
 import functools
 import math
 

@@ -6,8 +6,6 @@ Source:
     Ranftl et al. 2021, "Vision Transformers for Dense Prediction"; Lin et al. 2025, "Depth Anything 3".
 """
 
-from __future__ import annotations
-
 import functools
 
 import torch

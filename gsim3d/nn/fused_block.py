@@ -5,8 +5,6 @@ The residual stream is float32; what matrix products, convolution and attention 
 written out below, for a backward pass in as few launches.
 """
 
-from __future__ import annotations
-
 import functools
 from collections import namedtuple
 from typing import NamedTuple

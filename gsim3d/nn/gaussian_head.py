@@ -1,7 +1,5 @@
 """Particles -> 3D Gaussians -> images."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any, Literal

@@ -4,8 +4,6 @@
 splits the rows of a matrix product over threads is its own affair, and on some processors changes the last bits.
 """
 
-from __future__ import annotations
-
 import contextlib
 import contextvars
 from collections.abc import Sequence

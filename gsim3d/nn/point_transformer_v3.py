@@ -4,8 +4,6 @@ The layers are those of :mod:`gsim3d.nn.point_transformer`, without time and wit
 were trained with and the project's own network does otherwise stands here.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Resizing of maps as two matrix products, whose gradients need no atomics and repeat bit by bit."""
 
-from __future__ import annotations
-
 import functools
 from typing import Literal
 

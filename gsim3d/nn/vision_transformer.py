@@ -6,8 +6,6 @@ Source:
     Oquab et al. 2023, "DINOv2"; Lin et al. 2025, "Depth Anything 3".
 """
 
-from __future__ import annotations
-
 import functools
 from collections import OrderedDict
 from dataclasses import dataclass

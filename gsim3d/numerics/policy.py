@@ -13,8 +13,6 @@ With every policy, a particle that leaves the workspace or moves by more than ``
 ("clamp": stops at the limit), which the report counts and is no error. Other scenes keep equal bits.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal, get_args
 

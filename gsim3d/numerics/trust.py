@@ -5,8 +5,6 @@ histories. The spread of a particle over them, and the number of steps, give a b
 ``gsim3d evaluate --calibrate-trust`` fits to scenes with known motion and writes beside the weights (TRUST_FILE).
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import warnings

@@ -1,7 +1,5 @@
 """Validation of frames, particles and predicted steps: counts and sanitizes invalid values."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

@@ -4,8 +4,6 @@ The kernels check shapes, dtypes and index lists. Here it is made sure that tens
 the CPU that features and weights are numbers that an op can use; looking for those on a GPU would wait for it.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -8,8 +8,6 @@ by waiting for the device once. With P the softmax of S = scale Q K^T and O = P 
 The gradient of <dQ, A> + <dK, B> + <dV, C>, where dQ, dK, dV are the gradients of <G, O>, is that of <G, O'>.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

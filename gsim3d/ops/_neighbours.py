@@ -1,7 +1,5 @@
 """Pairs of neighbouring cells of sparse convolutions with any kernel, from lists of cells."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -5,8 +5,6 @@ rule themselves, it has higher ones; with rules of forward mode and vmap, the tr
 What it does not have ends with a :class:`gsim3d.GradientError`, never with None or 0.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Where the rows of a call meet a background that was computed before: whose scene, which cell, which patch."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

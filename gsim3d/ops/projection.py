@@ -1,7 +1,5 @@
 """Projection and colours of 3D Gaussians on their own, for programs that blend or densify by what it says."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """3D Gaussian splatting: packed scenes, times and views rendered in one call."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Blending of Gaussians that are projected already: the second half of the rasterizer, with any channels."""
 
-from __future__ import annotations
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Validation of a state: rows that cannot be used, what replaces them, and sums over each cloud, without waiting."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

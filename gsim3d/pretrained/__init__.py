@@ -5,8 +5,6 @@ data and duration), scores.json, README.md (model card), laws.json if the model 
 docs/results/stability.md (the worst error of each), and trust.json if its errors are calibrated.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Loading and saving of simulators: parses a saved configuration and validates weights against it."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

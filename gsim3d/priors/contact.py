@@ -1,7 +1,5 @@
 """Contact response: non-penetration of the static background, with Coulomb friction."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

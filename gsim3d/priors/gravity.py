@@ -1,7 +1,5 @@
 """Gravity: ballistic motion in flight; predicted displacements apply only in contact."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch

@@ -1,7 +1,5 @@
 """Inertia: particles continue the rigid motion of their window, modified by predicted gains."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch

@@ -1,7 +1,5 @@
 """Movable particles of the newest cloud of each scene, padded and subsampled, and windows around them."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn import functional as F

@@ -1,7 +1,5 @@
 """Sines and cosines of positions, by which attention finds particles at a given distance."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Weighted least-squares fits of rigid motions, rotations and planes to particles."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """Segmentation of particles into bodies, by the gaps between bodies when they are encoded."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch

@@ -1,7 +1,5 @@
 """Shape matching: elastic displacements towards the rest shape."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import torch

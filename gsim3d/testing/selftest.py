@@ -1,7 +1,5 @@
 """A quick check of every op against plain torch, for ``gsim3d doctor``: small inputs, forward and backward."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import torch

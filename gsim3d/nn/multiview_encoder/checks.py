@@ -1,7 +1,5 @@
 """Validation of the encoder's input: types and shapes first, then all values in one device synchronisation."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """Published weights of Depth Anything 3 and DINOv2, from safetensors files, by name."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The inverse renderer: images of calibrated cameras -> particles."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Depth and features of every pixel from a vision transformer, which may be pretrained and frozen."""
 
-from __future__ import annotations
-
 import importlib
 from contextlib import nullcontext
 
