@@ -21,9 +21,9 @@ All methods predict the same steps after 4 given ones and are scored from the sa
 (`gsim3d weights`), and Spring-Gaus a GPU.
 
 Scenes are measured in turn: a short --budget gives all rows of few scenes. Every measurement is a file in DIR/cells;
-the next call with the same options continues. Other weights, code or machine are measured again, and the values before
-move to DIR/last. --train needs scenes of another seed: DIR/data/WORLD-train is generated (--preset mini), or
-read from DATA/WORLD-train.
+the next call with the same options continues. Other weights or code (of times: machines) are measured again, and the
+values before move to DIR/last. --train needs scenes of another seed: DIR/data/WORLD-train is generated (--preset
+mini), or read from DATA/WORLD-train.
 
 Output in DIR: reproduce.md, reproduce.json, figures/.
 

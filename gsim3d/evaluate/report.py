@@ -94,12 +94,11 @@ def summarize(scores: Sequence[SceneScores], not_measured: dict[str, str] | None
 
 def _mean_physics(scores: Sequence[SceneScores], n_future: int) -> dict:
     """Means over scenes of what all scenes have."""
-    found: dict = {}
-    for method in dict.fromkeys(method for s in scores for method in s.physics):
-        known = [s.physics.get(method) for s in scores]
-        if all(known):
-            found[method] = {m: _numbers(torch.stack([k[m][:n_future] for k in known]).mean(0)) for m in MEASURES}
-    return found
+    methods = [method for method in scores[0].physics if all(s.physics.get(method) for s in scores)]
+    return {
+        method: {m: _numbers(torch.stack([s.physics[method][m][:n_future] for s in scores]).mean(0)) for m in MEASURES}
+        for method in methods
+    }
 
 
 def physics_table(summary: dict) -> list[str]:

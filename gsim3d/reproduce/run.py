@@ -24,7 +24,7 @@ from gsim3d.io.machine import machine
 from gsim3d.io.settings import to_dict
 from gsim3d.reproduce import page
 from gsim3d.reproduce.cells import Cells
-from gsim3d.reproduce.entries import ENTRIES, MAIN, TRAINED, Case, Entry
+from gsim3d.reproduce.entries import ENTRIES, MAIN, SPEED, TRAINED, Case, Entry
 from gsim3d.synth import generate
 from gsim3d.synth.held_out import SETS, origin_of
 from gsim3d.synth.worlds import build_world
@@ -36,7 +36,6 @@ WORLDS = ("elastic", "cloth", "rigid")
 SEED = SETS["validation"][0]
 TRAINING = "-train"  # ending of the folder of a world's training set
 NO_TIME = "the budget ended"
-CONDITIONS = ("device", "processor", "sources", "torch")  # of gsim3d.io.machine.machine
 
 Models = dict[str, dict[str, Restored]]  # world -> name -> model
 
@@ -146,7 +145,8 @@ class _Run:
         self._end = time.monotonic() + 60 * (math.inf if job.budget is None else job.budget)
         self._cells, self._costs, self._first = Cells(out), {}, {}
         facts = machine(torch.device(job.device))
-        self._conditions = {name: facts[name] for name in CONDITIONS if name in facts}
+        self._code = {name: facts[name] for name in ("sources", "torch")}
+        self._machine = {name: facts[name] for name in ("device", "processor") if name in facts}
 
     def score(self, models: Models) -> None:
         """Measures the entries scene by scene, so that a short budget gives all rows of few scenes."""
@@ -226,7 +226,8 @@ class _Run:
 
     def _measure(self, row: Row, scene: str, asked: dict, run: Callable[[], dict], reason: str | None) -> None:
         """Reads the cell of a row and scene, or measures it if there is no ``reason`` against it."""
-        name, asked = (row.table, row.world, row.label, scene), {**self._conditions, **asked}
+        machine = self._machine if row.table == SPEED else {"device": self.job.device}
+        name, asked = (row.table, row.world, row.label, scene), {**self._code, **machine, **asked}
         cell, before = self._cells.read(name, asked)
         if before is not None:
             row.before[scene] = before
@@ -238,7 +239,7 @@ class _Run:
             except (InputError, NumericalError, CaptureError, torch.OutOfMemoryError) as error:
                 reason = str(error).partition("\n")[0] or type(error).__name__
             else:
-                cell = {"asked": asked, "seconds": time.monotonic() - start, "device": self._conditions["device"],
+                cell = {"asked": asked, "seconds": time.monotonic() - start, "device": self._machine["device"],
                         "result": result, **result.pop("cost", {})}  # fmt: skip
                 self._cells.write(name, cell)
                 self.say(f"{row.table}, {row.world}: {row.label}, {scene}: {cell['seconds']:.1f} s")

@@ -5,6 +5,7 @@ import json
 import shutil
 
 import pytest
+import torch
 
 from gsim3d.baselines import BASELINES
 from gsim3d.cli.main import main
@@ -116,6 +117,16 @@ def test_the_next_call_continues(first, work, tmp_path, no_curves):
     content, lines, said = made(work, out, "one", "two")
     assert len(said) == 1 and "two, ball/0001" in said[0]
     assert lines[MAIN, "two"]["by_scene"] == first[1][MAIN, "two"]["by_scene"]
+
+
+def test_another_machine_measures_times_alone(first, work, tmp_path, no_curves, monkeypatch):
+    shutil.copytree(work / "out", tmp_path / "out")
+    facts = {**run.machine(torch.device("cpu")), "device": "another", "processor": "other"}
+    monkeypatch.setattr(run, "machine", lambda device: facts)
+    said = made(work, tmp_path / "out", "one", "two")[2]
+    assert len(said) == 2 and all(line.startswith("Speed") for line in said)
+    facts["sources"] = "of other code"
+    assert len(made(work, tmp_path / "out")[2]) > 2
 
 
 def test_other_weights_are_compared_with_the_last_run(first, work, tmp_path, no_curves):

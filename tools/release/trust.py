@@ -74,7 +74,7 @@ def declare_lens(folders: list[Path], fov: float) -> None:
         for camera in (metadata[f"cam_{cam}"] for cam in range(metadata["n_cams"])):
             focal = camera["resolution"][1] / 2 / np.tan(np.radians(fov) / 2)
             camera["intrinsics"][0][0] = camera["intrinsics"][1][1] = focal
-        (folder / "metadata.json").write_text(json.dumps(metadata, indent=1) + "\n")
+        write_json(folder / "metadata.json", metadata)
 
 
 def measures(restored: Restored, folders: list[Path], kept: Path, starts: tuple[int, ...] = (0,)) -> list[dict]:
