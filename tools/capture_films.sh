@@ -29,8 +29,10 @@ for words in "${films[@]}"; do
   name=${words%% *}
   capture "$name" plane_sweep
   [ -n "$weights" ] || continue
-  mkdir -p "$out/$name/dinov2_small"
-  cp -rln "$out/$name/plane_sweep/"{scenes,check.json,proposal.json} "$out/$name/dinov2_small" # prepared alike
+  if [ ! -f "$out/$name/dinov2_small/proposal.json" ]; then # prepared alike
+    mkdir -p "$out/$name/dinov2_small"
+    cp -rlf "$out/$name/plane_sweep/"{scenes,check.json,proposal.json} "$out/$name/dinov2_small"
+  fi
   capture "$name" dinov2_small --depth dinov2_small "$weights"
 done
 python -c "
