@@ -10,6 +10,7 @@ import numpy as np
 from gsim3d.capture.board import Board, Calibrated, calibrate_board
 from gsim3d.capture.films import BOARD, MIN_AGREEMENT, Film, films_in, takes_of, time_offsets
 from gsim3d.capture.sfm import calibrate_sfm
+from gsim3d.data.recording import read_json
 from gsim3d.data.videos import FILE, SAME_RATE
 from gsim3d.errors import InputError
 from gsim3d.io.files import write_whole
@@ -25,7 +26,7 @@ def calibrate(
     force: bool = False,
     say: Callable[[str], None] = print,
 ) -> list[Path]:
-    """Calibrates the films in ``folder`` and writes cameras.json beside the films of each take.
+    """Calibrates the films in ``folder`` and writes cameras.json beside the films of each take, with its "masks".
 
     Args:
         folder: films <camera>.mp4, or one folder of films for each take; films of the board lie in ``folder``/board,
@@ -66,7 +67,6 @@ def calibrate(
             "closer and with pauses, by cameras that do not move (--force goes on)"
         )
     cameras = _scaled(cameras, scale, board is not None, say)
-    written = []
     for take, files in takes.items():
         films = films if files == shown else [Film.open(file) for file in files]
         for film, camera in zip(films, cameras, strict=True):
@@ -74,8 +74,10 @@ def calibrate(
                 raise InputError(f"{film.video.what}: has {film.size} pixels, the film of the board {camera.size}")
         say(f"{take}:")
         offsets, agreement = _offsets(films, say)
-        written.append(take / FILE)
-        write_whole(take / FILE, _description(cameras, offsets, agreement, _common_rate(films, say)))
+        before = read_json(take / FILE) if (take / FILE).is_file() else {}
+        keys = {"resample": _common_rate(films, say), "masks": before.get("masks")}
+        write_whole(take / FILE, _description(cameras, offsets, agreement, keys))
+    written = [take / FILE for take in takes]
     say(f"calibrate: wrote {', '.join(map(str, written))}")
     return written
 
@@ -112,13 +114,14 @@ def _common_rate(films: Sequence[Film], say: Callable[[str], None]) -> float | N
     return min(rates)
 
 
-def _description(cameras: Sequence[Calibrated], offsets, agreement, resample: float | None) -> str:
+def _description(cameras: Sequence[Calibrated], offsets, agreement, keys: dict) -> str:
     entries = []
     for camera, offset, own in zip(cameras, offsets, agreement, strict=True):
-        K, R, T = camera.K.tolist(), camera.viewmat[:3, :3].tolist(), camera.viewmat[:3, 3].tolist()
-        entry = {"name": camera.name, "size": list(camera.size), "K": K, "R": R, "T": T}
-        entry |= {"distortion": camera.distortion.tolist(), "offset": round(float(offset), 6)}
+        K, R, T, lens = (
+            x.tolist() for x in (camera.K, camera.viewmat[:3, :3], camera.viewmat[:3, 3], camera.distortion)
+        )
+        entry = {"name": camera.name, "size": list(camera.size), "K": K, "R": R, "T": T, "distortion": lens}
         found = {"error": camera.error, "images": camera.views, "motion_agreement": float(own)}
-        entries.append(entry | {"calibration": found})
-    content = {"pixel_center": 0, **({} if resample is None else {"resample": resample}), "cameras": entries}
+        entries.append(entry | {"offset": round(float(offset), 6), "calibration": found})
+    content = {"pixel_center": 0, **{key: value for key, value in keys.items() if value}, "cameras": entries}
     return json.dumps(content, indent=1) + "\n"

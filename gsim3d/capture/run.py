@@ -35,7 +35,7 @@ from gsim3d.train.restore import restore
 from gsim3d.train.run import train
 
 PHASES = ((0, 0.35, 2e-3), (3, 0.25, 1e-3), (12, 0.4, 1e-3))  # horizon, share of the time, learning rate
-DEPTH_RATE = 0.15  # learning rates from pretrained depth, relative to the others
+DEPTH_RATE = 0.15  # learning rate of a pretrained encoder, relative to the other parts
 BATCH = {"cpu": 1, "cuda": 4}
 PROBED = 3  # optimizer steps of each phase that are timed
 SCORED_STEPS = 12  # predicted steps of a scored window
@@ -187,17 +187,19 @@ class _Run:
         cache = self.out / "cache"
         takes = [prepare.open_take(path, cache) for path in find_scenes(self.folder)]
         proposal = prepare.propose(takes, self.device, self.say)
+        least = prepare.HISTORY[self.device] + 2
         train, test = ([(take, range(take.n_steps)) for take in part] for part in split_scenes(takes))
         if not test:
-            take, least = takes[0], prepare.HISTORY[self.device] + 2
-            end = take.n_steps - max(least, round(prepare.HELD_OUT_SHARE * take.n_steps))
-            if end < least:
-                have = f"{take.n_steps} common frames at {take.fps:g} a second"
-                raise InputError(f"{take.path}: {have}; at least {2 * least} are needed")
+            take = takes[0]
+            end = max(0, take.n_steps - max(least, round(prepare.HELD_OUT_SHARE * take.n_steps)))
             train, test = [(take, range(end))], [(take, range(end, take.n_steps))]
             self.say(f"  held out: the last {take.n_steps - end} of {take.n_steps} frames")
         else:
             self.say(f"  held out: {', '.join(take.name for take, _ in test)}")
+        for take, steps in train + test:
+            if len(steps) < least:
+                have = f"{len(steps)} common frames at {take.fps:g} a second are left"
+                raise InputError(f"{take.path}: {have}; at least {least} to train on, and {least} held out, are needed")
         scenes = self.out / "scenes"
         for part, chosen in (("train", train), ("test", test)):
             (scenes / part).mkdir(parents=True, exist_ok=True)
@@ -219,10 +221,8 @@ class _Run:
         held_out = proposal["held_out_camera"]
         n_inputs = len(proposal["crops"]) - (held_out is not None)
         horizons = sorted({min(horizon, shortest - history) for horizon, _, _ in PHASES})
-        rates = [rate * (DEPTH_RATE if self.depth else 1) for *_, rate in PHASES]
-        phases = [
-            PhaseConfig(PROBED, h, learning_rate=r, batch=BATCH[device], warm_up=0.1) for h, r in zip(horizons, rates)
-        ]
+        phase = {"steps": PROBED, "batch": BATCH[device], "warm_up": 0.1}
+        phases = [PhaseConfig(horizon=n, learning_rate=rate, **phase) for n, (*_, rate) in zip(horizons, PHASES)]
         model = {"dynamics": {"drop_path": 0.0, "shuffle_orders": False}} if device == "cuda" else {}
         if self.depth:
             model["encoder"] = {"backbone": "vit_dpt", "vit": {"model": self.depth[0]}}
@@ -240,7 +240,7 @@ class _Run:
                 leave_one_out=True,
             ),
             loss=LossConfig(body_weight=2.0, image_gain=True),
-            optimizer=OptimizerConfig(clip_norm=1.0, ema_decay=0.98),
+            optimizer=OptimizerConfig(clip_norm=1.0, ema_decay=0.98, encoder_rate=DEPTH_RATE if self.depth else 1.0),
             captured=device == "cuda",
         )
 

@@ -36,9 +36,8 @@ def calibrate_sfm(films: Sequence[Film]) -> list[Calibrated]:
         images, database = Path(temporary) / "images", Path(temporary) / "features.db"
         images.mkdir()
         for film in films:
-            background = background_image(
-                lambda steps: np.stack([*film.video.read(steps, Problems())]), len(film.video.times)
-            )
+            video = film.video
+            background = background_image(lambda at: np.stack([*video.read(at, Problems())]), len(video.times))
             cv2.imwrite(str(images / f"{film.name}.png"), background[..., ::-1])
         pycolmap.logging.minloglevel = pycolmap.logging.ERROR
         options = pycolmap.IncrementalPipelineOptions()

@@ -29,7 +29,10 @@ STARTS = (0.0, 3 / FPS, -2 / FPS)  # seconds
 @pytest.fixture(scope="module")
 def films(tmp_path_factory):
     folder = write_board_films(tmp_path_factory.mktemp("films"), BOARD, rig(), STARTS)
+    (folder / "cameras.json").write_text('{"masks": "none", "near": 9}')
     assert main(["calibrate", str(folder), "--board", "7", "5", "0.06"]) == 0
+    written = json.loads((folder / "cameras.json").read_text())
+    assert written["masks"] == "none" and "near" not in written  # the world is another
     return folder
 
 

@@ -91,6 +91,14 @@ def test_takes_of_equal_names_stay_apart(tmp_path):
     assert [path.name for path in run.scenes("test")] == ["ball_0000"]
 
 
+def test_takes_that_are_too_short_are_named(tmp_path):
+    for name, n_frames in (("a", 24), ("b", 24), ("c", 6)):
+        write_take(tmp_path / "films" / name, n_frames=n_frames)
+    run = _Run(tmp_path / "films", tmp_path / "run", "cpu", 1.0, None, False, lambda _: None)
+    with pytest.raises(InputError, match=r"films/c: 3 common frames at 15 a second are left; at least 4 to train on"):
+        run.propose()
+
+
 def test_files_that_are_missing_are_named(tmp_path, capsys):
     folder = write_take(tmp_path / "ball", n_frames=16)
     arguments = ["capture", str(folder), "--out", str(tmp_path / "run")]
