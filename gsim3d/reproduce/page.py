@@ -148,21 +148,16 @@ def _numbers(cells: dict[str, dict], method: str) -> tuple[dict, dict, dict]:
 
 def _difference(line: Line, other: dict[str, float]) -> tuple[float, float | None] | None:
     """Mean and standard error of the paired difference over the scenes of both; None if they share none."""
-    pairs = [
-        value - other[scene]
-        for scene, value in line.by_scene.items()
-        if value is not None and other.get(scene) is not None
-    ]
+    both = ((value, other.get(scene)) for scene, value in line.by_scene.items())
+    pairs = [a - b for a, b in both if a is not None and b is not None]
     return paired(pairs) if pairs else None
 
 
 def _add_times(lines: Sequence[Line], speeds: Sequence[Row]) -> None:
     """Adds the time of a step and the number of parameters to the lines of models."""
+    found = {row.model: _numbers(row.cells, "")[0] for row in speeds if row.cells}
     for line in lines:
-        for row in speeds:
-            if line.label == row.model and row.cells:
-                found = _numbers(row.cells, "")[0]
-                line.numbers |= {key: found[key] for key in ("step_ms", "parameters")}
+        line.numbers |= {key: found[line.label][key] for key in ("step_ms", "parameters") if line.label in found}
 
 
 def _table(lines: Sequence[Line]) -> str:
