@@ -156,7 +156,6 @@ class Episodes:
         if not isinstance(image_size, Integral) or image_size < 1:
             raise InputError(f"image_size must be a whole number of at least 1; got {image_size!r}")
         self.task, self.count, self.observation, self.rig = task, count, observation, task_rig(image_size)
-        self.scenes: Scenes
         if backend == "model":
             if model is None and task.shipped not in pretrained.names():
                 raise InputError('backend="model" needs model=PATH, a checkpoint of a trained simulator')
@@ -329,11 +328,13 @@ class TaskVectorEnv(VectorEnv):
         episodes, over = self._episodes, self._over
         if self.mode is AutoresetMode.DISABLED and over.any():
             raise InputError(f"environments {over.nonzero()[0].tolist()} have ended; reset them with reset_mask")
+        actions, begun = episodes.numbers(actions), torch.from_numpy(over).to(self.scenes.device)
+        if actions.shape == self.action_space.shape:
+            actions = actions.masked_fill(begun[:, None], 0)  # the step after an end ignores the action
         if not over.all():
-            episodes.act(episodes.numbers(actions))
+            episodes.act(actions)
         self._begin(over)
         self._steps += ~over
-        begun = torch.from_numpy(over).to(self.scenes.device)
         rewards = (-episodes.distances).masked_fill(begun, 0.0)
         terminated = episodes.ended & ~begun
         late = self._steps >= (np.inf if self._most_steps is None else self._most_steps)
@@ -368,8 +369,7 @@ class TaskVectorEnv(VectorEnv):
         final = np.full(self.num_envs, None, dtype=object)
         for number in self._over.nonzero()[0].tolist():
             final[number] = {name: value[number] for name, value in observed.items()}
-        kept = {name: value for name, value in infos.items() if not name.startswith("_")}
-        found = {"final_obs": final, "final_info": self._infos(kept, self._over)}
+        found = {"final_obs": final, "final_info": self._infos(self._episodes.info(), self._over)}
         return {**infos, **self._infos(found, self._over)}
 
     def _given(self, value: Any) -> Any:

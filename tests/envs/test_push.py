@@ -179,8 +179,25 @@ def test_seeds_may_be_an_array_and_actions_stay_as_they_are():
     for _ in range(3):
         envs.step(given)
     assert (given == 0.5).all()
+    envs.reset(seed=3)
+    with pytest.raises(InputError, match="action must be 3 numbers"):
+        envs.step(given[:1])
     with pytest.raises(InputError, match="action must be 3 numbers; got 'up'"):
-        envs.reset(seed=3), envs.step("up")
+        envs.step("up")
+
+
+def test_the_step_after_an_end_ignores_the_action():
+    envs = gymnasium.make_vec("gsim3d/PushToGoal-v0", num_envs=2, max_episode_steps=3)
+    envs.reset(seed=1)
+    envs.step(np.zeros((2, 2)))
+    envs.reset(seed=2, options={"reset_mask": np.array([False, True])})
+    for _ in range(2):
+        truncated = envs.step(np.zeros((2, 2)))[3]
+    assert truncated.tolist() == [True, False]
+    observed, rewards, *_ = envs.step(np.array([[np.nan, 9.0], [0.1, 0.1]]))
+    assert rewards[0] == 0 > rewards[1] and np.isfinite(observed["particles"]).all()
+    with pytest.raises(InputError, match="action must be 2 numbers of at most"):
+        envs.step(np.array([[np.nan, 0.1], [0.1, 0.1]]))
 
 
 def test_missing_gymnasium_is_one_clear_error():
