@@ -14,7 +14,8 @@ from gsim3d.planning import MPPI
 
 gymnasium = pytest.importorskip("gymnasium", reason="needs gymnasium: pip install 'gsim3d[envs]'")
 pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'gsim3d[envs]'")
-from gymnasium.utils.env_checker import check_env  # noqa: E402
+from gymnasium.utils.env_checker import check_env, data_equivalence  # noqa: E402
+from gymnasium.vector import AutoresetMode, SyncVectorEnv  # noqa: E402
 
 from gsim3d.envs.push import FPS, MAX_SPEED, N_PARTICLES, REACHED, WORKSPACE, PushClear, PushToGoal  # noqa: E402
 from gsim3d.envs.push_planning import GoalCost, TrueDynamics  # noqa: E402
@@ -184,6 +185,22 @@ def test_seeds_may_be_an_array_and_actions_stay_as_they_are():
         envs.step(given[:1])
     with pytest.raises(InputError, match="action must be 3 numbers; got 'up'"):
         envs.step("up")
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_vector_environments_equal_those_of_gymnasium(mode):
+    """Over three ends of episodes: observations, rewards, flags and infos, in all bits."""
+    options = {"num_envs": 2, "max_episode_steps": 2}
+    wanted = SyncVectorEnv([lambda: make("PushClear", max_episode_steps=2)] * 2, autoreset_mode=mode)
+    envs = gymnasium.make_vec("gsim3d/PushClear-v0", autoreset_mode=mode, **options)
+    assert data_equivalence(envs.reset(seed=4), wanted.reset(seed=4), exact=True)
+    for step in range(8):
+        actions = np.random.default_rng(step).uniform(-MAX_SPEED, MAX_SPEED, (2, 2)).astype(np.float32)
+        expected = wanted.step(actions)
+        assert data_equivalence(envs.step(actions), expected, exact=True)
+        over = {"reset_mask": expected[2] | expected[3]}
+        if mode is AutoresetMode.DISABLED and over["reset_mask"].any():
+            assert data_equivalence(envs.reset(options=over), wanted.reset(options=dict(over)), exact=True)
 
 
 def test_the_step_after_an_end_ignores_the_action():
