@@ -10,13 +10,15 @@ They need the packages gymnasium and MuJoCo: ``pip install 'gsim3d[envs]'``.
 """
 
 from gsim3d.errors import InputError
+from gsim3d.synth.mujoco_engine import load_mujoco
 
 try:
     import gymnasium
-except ImportError:
-    raise InputError("gsim3d.envs needs the package gymnasium: pip install 'gsim3d[envs]'") from None
 
-from gsim3d.envs import cloth, push
+    load_mujoco()
+except ImportError as error:
+    raise InputError(f"gsim3d.envs needs more packages: pip install 'gsim3d[envs]' ({error})") from None
+
 from gsim3d.envs.cloth import ClothCover
 from gsim3d.envs.hybrid import HybridScene
 from gsim3d.envs.push import PushClear, PushToGoal
@@ -25,7 +27,7 @@ from gsim3d.envs.throw import ThrowToTarget
 
 __all__ = ["ClothCover", "HybridScene", "PushClear", "PushToGoal", "ThrowToTarget"]
 
-_MAX_STEPS = {PushToGoal: push.MAX_STEPS, PushClear: push.MAX_STEPS, ThrowToTarget: None, ClothCover: cloth.MAX_STEPS}
+_MAX_STEPS = {PushToGoal: 60, PushClear: 60, ThrowToTarget: None, ClothCover: 60}  # five seconds
 for _env, _max_steps in _MAX_STEPS.items():
     _vector = f"{_env.__name__}Vector"  # names in a spec are of the form module:class
     globals()[_vector] = type(_vector, (TaskVectorEnv,), {"task": _env, "__module__": __name__})

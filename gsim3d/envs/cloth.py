@@ -15,7 +15,6 @@ from gsim3d.synth.render import Surface
 from gsim3d.synth.shapes import icosphere
 from gsim3d.synth.world import CLOTH_COLOR, CLOTH_REFINEMENT
 
-MAX_STEPS = 60  # five seconds
 MAX_SPEED = 0.5  # m/s of each gripper along each axis
 WORKSPACE, LOWEST, HIGHEST = 1.0, 0.02, 0.6  # metres: bounds of a gripper's distance from the middle and of its height
 WIDTH, COUNT, MASS, YOUNG, THICKNESS, DAMPING = 0.8, 13, 0.3, 7e4, 0.008, 0.015  # of the cloth; see synth.Cloth

@@ -12,7 +12,6 @@ from gsim3d.synth import pushing
 from gsim3d.synth.embedding import RigidFrame
 from gsim3d.synth.scene_setup import Pusher
 
-MAX_STEPS = 60  # five seconds
 MAX_SPEED = 0.5  # m/s of the pusher, along x and y
 WORKSPACE = 1.0  # metres from the middle; the pusher stays inside
 REACHED = 0.05  # metres of the body's centre from the goal

@@ -217,8 +217,9 @@ def test_the_step_after_an_end_ignores_the_action():
         envs.step(np.array([[np.nan, 0.1], [0.1, 0.1]]))
 
 
-def test_missing_gymnasium_is_one_clear_error():
-    code = "import sys; sys.modules['gymnasium'] = None\nimport gsim3d.envs"
+@pytest.mark.parametrize("package", ["gymnasium", "mujoco"])
+def test_missing_packages_are_one_clear_error(package):
+    code = f"import sys; sys.modules['{package}'] = None\nimport gsim3d.envs"
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert "pip install 'gsim3d[envs]'" in ended.stderr
 
