@@ -121,7 +121,7 @@ class Planner(ABC):
 
     @abstractmethod
     def _search(self, state: Any, best: _Best, executed: int) -> None:
-        """Improves ``best``, which holds the sequence to begin with; calls ``best.end_iteration`` once an iteration."""
+        """Improves ``best``, which holds the sequence to begin with; extends its history once an iteration."""
 
     def _costs(self, state: Any, actions: Tensor) -> Tensor:
         """Costs of sequences [K, H, A], float64 [K] on the CPU; infinite where they are not finite."""
@@ -141,10 +141,7 @@ class Planner(ABC):
         """[K, H, A]: ``mean`` first, then sequences around it, inside the bounds."""
         shape = (self.samples - 1, len(self.low), self.horizon)
         noise = colored_noise(shape, self.color, self._generator).transpose(1, 2).to(mean)
-        return torch.cat([mean[None], self._bounded(mean + std * noise)])
-
-    def _bounded(self, actions: Tensor) -> Tensor:
-        return torch.minimum(torch.maximum(actions, self.low), self.high)
+        return torch.cat([mean[None], (mean + std * noise).clamp(self.low, self.high)])
 
     def _initial_std(self) -> Tensor:
         return (self.noise * (self.high - self.low)).expand(self.horizon, -1)
@@ -179,7 +176,7 @@ class MPPI(Planner):
             if costs.isfinite().any():
                 weights = softmin(costs, self.temperature, max(1.0, self.effective_share * self.samples))
                 mean = torch.einsum("k,kha->ha", weights.to(mean), sequences)
-            best.end_iteration()
+            best.history.append(best.cost)
         best.update(mean[None], self._costs(state, mean[None]))
         best.history[-1] = best.cost
 
@@ -230,7 +227,7 @@ class CEM(Planner):
             mean = self.momentum * mean + (1 - self.momentum) * elites.mean(0)
             std = self.momentum * std + (1 - self.momentum) * elites.std(0, correction=0)
             std = torch.maximum(std, self.min_std * (self.high - self.low))
-            best.end_iteration()
+            best.history.append(best.cost)
         self._kept = kept
 
 
@@ -265,10 +262,10 @@ class GradientDescent(Planner):
             if not scaled.grad.isfinite().all():
                 break  # the best sequence so far stands
             optimizer.step()
-            scaled.copy_(self._bounded(scaled * scale) / scale)
-            actions = self._bounded(scaled.detach() * scale)[None]
+            scaled.copy_((scaled * scale).clamp(self.low, self.high) / scale)
+            actions = (scaled.detach() * scale).clamp(self.low, self.high)[None]
             best.update(actions, self._costs(state, actions))
-            best.end_iteration()
+            best.history.append(best.cost)
 
 
 class _Best:
@@ -283,9 +280,6 @@ class _Best:
             self.actions, self.cost = sequences[lowest].clone(), float(costs[lowest])
         if not math.isfinite(self.cost):
             raise NumericalError("no sequence of actions has a finite cost; check the dynamics and the cost")
-
-    def end_iteration(self) -> None:
-        self.history.append(self.cost)
 
 
 def _shifted(actions: Tensor, steps: int) -> Tensor:
