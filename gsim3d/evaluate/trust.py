@@ -31,11 +31,8 @@ Samples = tuple[np.ndarray, np.ndarray]  # spread and error in metres, [S, M] ea
 
 
 def samples(scene: Scene, prediction: Prediction) -> Samples | None:
-    """Spread and error of the moving particles at each predicted step of a scene that is predicted from its start.
-
-    Returns:
-        [S, M] metres each; None if nothing moves, or the scene has no ``states.npz``.
-    """
+    """Returns spread and error, [S, M] metres each, of the moving particles at each predicted step of a scene that is
+    predicted from its start; None if nothing moves, or the scene has no ``states.npz``."""
     states, last = true_states(scene), prediction.n_encoded - 1
     given = prediction.step(last)
     moving = given.activity == DYNAMIC
@@ -74,10 +71,8 @@ def calibrate(restored: Restored, scenes: Sequence[Scene], n_future: int) -> Tru
         raise InputError(f"trust: needs two or more scenes to calibrate; got {len(scenes)}")
     restored.simulator.trust = None  # an older calibration announces nothing here
     found = fit_bounds(collect(restored, scenes, n_future))
-    measured = []
-    for scene in scenes:
-        for start in (0, (scene.n_steps - restored.n_encoded) // 2):
-            measured.append(measure_scene(restored, scene, start))
+    inputs = [(scene, start) for scene in scenes for start in (0, (scene.n_steps - restored.n_encoded) // 2)]
+    measured = [measure_scene(restored, *one) for one in inputs]
     return Trust(n_scenes=len(scenes), n_steps=n_future, **found, **fit_ranges(measured))
 
 
