@@ -122,7 +122,8 @@ def _detect(films: Sequence[Film], offsets: Sequence[float], board: Board) -> li
     times = times[(times >= low - 1e-6) & (times <= high + 1e-6)]
     times = calm_times(times, films, offsets)
     for film, offset in zip(films, offsets, strict=True):
-        numbers, found = film.nearest(times - offset), {}
+        own, found = film.video.times + offset, {}
+        numbers = np.searchsorted((own[1:] + own[:-1]) / 2, times).tolist()
         for frame, image in enumerate(film.grey(numbers)):
             corners, ids, *_ = detector.detectBoard(image)
             if ids is not None and len(ids) >= MIN_CORNERS:

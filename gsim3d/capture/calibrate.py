@@ -77,9 +77,8 @@ def calibrate(
         before = read_json(take / FILE) if (take / FILE).is_file() else {}
         keys = {"resample": _common_rate(films, say), "masks": before.get("masks")}
         write_whole(take / FILE, _description(cameras, offsets, agreement, keys))
-    written = [take / FILE for take in takes]
-    say(f"calibrate: wrote {', '.join(map(str, written))}")
-    return written
+    say(f"calibrate: wrote {', '.join(str(take / FILE) for take in takes)}")
+    return [take / FILE for take in takes]
 
 
 def _offsets(films: Sequence[Film], say: Callable[[str], None]) -> tuple[np.ndarray, np.ndarray]:
@@ -117,9 +116,8 @@ def _common_rate(films: Sequence[Film], say: Callable[[str], None]) -> float | N
 def _description(cameras: Sequence[Calibrated], offsets, agreement, keys: dict) -> str:
     entries = []
     for camera, offset, own in zip(cameras, offsets, agreement, strict=True):
-        K, R, T, lens = (
-            x.tolist() for x in (camera.K, camera.viewmat[:3, :3], camera.viewmat[:3, 3], camera.distortion)
-        )
+        numbers = camera.K, camera.viewmat[:3, :3], camera.viewmat[:3, 3], camera.distortion
+        K, R, T, lens = (values.tolist() for values in numbers)
         entry = {"name": camera.name, "size": list(camera.size), "K": K, "R": R, "T": T, "distortion": lens}
         found = {"error": camera.error, "images": camera.views, "motion_agreement": float(own)}
         entries.append(entry | {"offset": round(float(offset), 6), "calibration": found})

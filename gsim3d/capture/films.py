@@ -53,11 +53,6 @@ class Film:
         for image in progress(self.video.read(numbers, Problems()), self.name, len(numbers), unit="frame"):
             yield cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
 
-    def nearest(self, times: np.ndarray) -> list[int]:
-        """Returns the frame number nearest to each of ``times``, seconds of this film."""
-        own = self.video.times
-        return np.searchsorted((own[1:] + own[:-1]) / 2, times).tolist()
-
     @cached_property
     def motion(self) -> np.ndarray:
         """Returns [N - 1], the root mean squared difference between consecutive frames.

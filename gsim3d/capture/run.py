@@ -198,8 +198,7 @@ class _Run:
             self.say(f"  held out: {', '.join(take.name for take, _ in test)}")
         for take, steps in train + test:
             if len(steps) < least:
-                have = f"{len(steps)} common frames at {take.fps:g} a second are left"
-                raise InputError(f"{take.path}: {have}; at least {least} to train on, and {least} held out, are needed")
+                raise InputError(f"{take.path}: has {len(steps)} usable frames at {take.fps:g} a second, needs {least}")
         scenes = self.out / "scenes"
         for part, chosen in (("train", train), ("test", test)):
             (scenes / part).mkdir(parents=True, exist_ok=True)
@@ -268,9 +267,9 @@ class _Run:
         config = from_dict(TrainConfig, settings)
         train(config, self.scenes("train"), self.out / "model", device=self.device)
         last = (self.out / "model" / LOG).read_text().splitlines()[-1]
-        minutes = json.loads(last)["machine"]["seconds"] / 60
+        minutes = round(json.loads(last)["machine"]["seconds"] / 60, 2)
         machine = torch.cuda.get_device_name() if self.device == "cuda" else self.device
-        return {"device": machine, "minutes": round(minutes, 2), "steps": config.n_steps}
+        return {"device": machine, "minutes": minutes, "steps": config.n_steps}
 
     def score(self, trained: dict) -> dict:
         """Scores windows of the held-out steps against the constant baseline."""

@@ -95,7 +95,7 @@ def test_takes_that_are_too_short_are_named(tmp_path):
     for name, n_frames in (("a", 24), ("b", 24), ("c", 6)):
         write_take(tmp_path / "films" / name, n_frames=n_frames)
     run = _Run(tmp_path / "films", tmp_path / "run", "cpu", 1.0, None, False, lambda _: None)
-    with pytest.raises(InputError, match=r"films/c: 3 common frames at 15 a second are left; at least 4 to train on"):
+    with pytest.raises(InputError, match=r"films/c: has 3 usable frames at 15 a second, needs 4"):
         run.propose()
 
 
