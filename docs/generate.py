@@ -13,7 +13,8 @@ from statistics import mean, stdev
 DOCS = Path(__file__).parent
 ROOT, RESULTS = DOCS.parent, DOCS / "results"
 CAPTURES_HEAD = ("films", "encoder", "machine", "minutes", "steps", "windows")
-CAPTURES_HEAD += ("masked PSNR dB", "constant dB", "above constant", "above plane sweep")
+CAPTURES_HEAD += ("masked PSNR dB", "constant dB", "copy dB", "above constant", "above copy", "above plane sweep")
+CAPTURE_METHODS = "model", "constant", "copy"
 COST_HEAD = ("#", "setting", "kind", "step ms", "p95", "encode ms", "faster", "agreement dB", "masked PSNR dB", "kept")
 
 
@@ -207,7 +208,7 @@ def captures(folder: Path) -> str:
     windows = {run: scores["of_windows"] for run, scores in found.items()}
     for encoder in sorted({encoder for _, encoder in windows}):
         runs = [own for (_, other), own in windows.items() if other == encoder]
-        windows["all", encoder] = {method: sum((run[method] for run in runs), []) for method in ("model", "constant")}
+        windows["all", encoder] = {method: sum((run[method] for run in runs), []) for method in CAPTURE_METHODS}
 
     def apart(a: list[float], b: list[float]) -> str:
         differences = [x - y for x, y in zip(a, b, strict=True)]
@@ -217,11 +218,12 @@ def captures(folder: Path) -> str:
     rows = []
     for (films, encoder), own in windows.items():
         run, sweep = found.get((films, encoder), {}), windows.get((films, "plane_sweep"))
-        is_paired = encoder != "plane_sweep" and sweep and sweep["constant"] == own["constant"]  # of the same windows
+        is_paired = encoder != "plane_sweep" and sweep and sweep["copy"] == own["copy"]  # of the same windows
         rows.append(
             (films.replace("_", " "), encoder, *(run.get(key, "") for key in ("device", "minutes", "steps")))
-            + (len(own["model"]), f"{mean(own['model']):.2f}", f"{mean(own['constant']):.2f}")
-            + (apart(own["model"], own["constant"]), apart(own["model"], sweep["model"]) if is_paired else "")
+            + (len(own["model"]), *(f"{mean(own[method]):.2f}" for method in CAPTURE_METHODS))
+            + tuple(apart(own["model"], own[method]) for method in CAPTURE_METHODS[1:])
+            + (apart(own["model"], sweep["model"]) if is_paired else "",)
         )
     return table(CAPTURES_HEAD, rows)
 

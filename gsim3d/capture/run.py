@@ -274,29 +274,28 @@ class _Run:
     def score(self, trained: dict) -> dict:
         """Scores windows of the held-out steps against the constant baseline."""
         restored, metric = restore(self.out / "model", self.device), "psnr_masked"
-        values: dict[str, list[float]] = {"model": [], "constant": []}  # of each window
+        values: dict[str, list[float]] = {"model": [], "constant": [], "copy": []}  # of each window
         for folder in self.scenes("test"):
             scene = restored.open_scene(folder)
             n_future = min(SCORED_STEPS, scene.n_steps - restored.n_encoded)
             starts = range(0, scene.n_steps - restored.n_encoded - n_future + 1, n_future)
             for start in starts[: MOST_WINDOWS - len(values["model"])]:
-                window = {"start": start, "n_future": n_future, "metrics": [metric], "methods": ["constant"]}
+                window = {"start": start, "n_future": n_future, "metrics": [metric], "methods": ["constant", "copy"]}
                 scores = score_scene(restored, scene, **window)
                 found = [float(scores.values[method][metric][scores.n_encoded :].nanmean()) for method in values]
                 for own, value in zip(values.values(), found, strict=True):
                     own += [value] if np.isfinite(found).all() else []
         if not values["model"]:
             raise InputError(f"{self.out / 'scenes' / 'test'}: no moving body is visible; film longer, or more takes")
-        differences = np.subtract(*values.values())
+        differences = np.subtract(values["model"], values["constant"])
         gain, count = float(differences.mean()), len(differences)
         error = float(np.std(differences, ddof=1) / np.sqrt(count)) if count > 1 else None
         means = {method: float(np.mean(own)) for method, own in values.items()}
         beats = error is not None and gain > 2 * error
         spread = "one window, no error" if error is None else f"+- {error:.2f}"
         self.say(
-            f"  masked PSNR of {count} held-out windows: model {means['model']:.2f} dB, constant "
-            f"{means['constant']:.2f} dB: {gain:+.2f} dB ({spread}), {'' if beats else 'not '}above constant by two "
-            "standard errors"
+            f"  masked PSNR of {count} held-out windows: {', '.join(f'{n} {x:.2f} dB' for n, x in means.items())}; "
+            f"{gain:+.2f} dB ({spread}), {'' if beats else 'not '}above constant by two standard errors"
         )
         result = {"gain": gain, "standard_error": error, "windows": count, "above_constant": beats}
         return {**trained, **means, **result, "of_windows": values}
