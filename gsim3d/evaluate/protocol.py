@@ -338,7 +338,7 @@ def score_scene(
         objects, own = images * (labels == MOVING)[..., None], [m for m in metrics if m not in (*NEEDS_LABELS, "fvd")]
         truth = SceneTruth(scene.name, objects, labels, valid, n_encoded, own)
         scores.values.update(truth.score(alone).values)
-    physics = measure_tracks(tracks, scene, range(n_given - 1, n_given + n_future))
+    physics = measure_tracks(tracks, scene, range(n_given - 1, n_given + n_future)) if tracks else {}
     fitted = {other.name: other.found() for other in fits}
     return dataclasses.replace(scores, digest=digest, physics=physics, fitted=fitted)
 

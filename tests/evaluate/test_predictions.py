@@ -73,6 +73,7 @@ def test_predictions_are_fitted_like_their_scene(tmp_path):
     scene = Scene.open(tmp_path / "room")
     assert scene.recording.real_background and scene.valid([0], [0]) is not None
     same = Predictions.open(f"same={scene.path}", scene.path)
+    (scene.path / "states.npz").write_bytes(b"damaged")  # images alone are not measured beside true states
     values = score_scene(None, scene, target_cams=(0, 1, 2), n_encoded=2, n_future=3, others=[same]).values
     for metric, best in (("psnr", 100.0), ("psnr_masked", 100.0), ("ssim", 1.0)):
         assert values["same"][metric][2:].tolist() == pytest.approx([best] * 3, abs=1e-9)
