@@ -221,27 +221,28 @@ def table(summary: dict) -> str:
     methods = summary["methods"]
     shown = [m for m in METRICS if f"{_prefix(methods[0])}future.{m}" in summary]
     by_step = [m for m in shown if METRICS[m].by_step]
-    lines = [
-        f"{summary['n_scenes']} scenes, {summary['n_encoded_steps']} steps given, {summary['n_future_steps']} predicted"
-        f" (PSNR in dB; {REGIONS})",
-        *facts(summary),
-        "",
-        f"{'':34}" + "".join(f"{METRICS[m].label:>13}" for m in shown),
-    ]
     rows = [("model, given steps", "past")] if "model" in methods else []
     for method in methods:
         prefix = _prefix(method)
         if not any(f"{prefix}future.{m}" in summary for m in shown):
             continue
         rows += [(f"{method}, predicted steps", f"{prefix}future"), ("  second half of them", f"{prefix}future_late")]
+    width = max([34, *(len(name) + 2 for name, _ in rows)])
+    lines = [
+        f"{summary['n_scenes']} scenes, {summary['n_encoded_steps']} steps given, {summary['n_future_steps']} predicted"
+        f" (PSNR in dB; {REGIONS})",
+        *facts(summary),
+        "",
+        f"{'':{width}}" + "".join(f"{METRICS[m].label:>13}" for m in shown),
+    ]
     for name, key in rows:
-        lines.append(f"{name:34}" + "".join(f"{_number(summary.get(f'{key}.{m}'), m):>13}" for m in shown))
-    lines += ["", f"{f'{methods[0]}, step':34}" + "".join(f"{METRICS[m].label:>13}" for m in by_step)]
+        lines.append(f"{name:{width}}" + "".join(f"{_number(summary.get(f'{key}.{m}'), m):>13}" for m in shown))
+    lines += ["", f"{f'{methods[0]}, step':{width}}" + "".join(f"{METRICS[m].label:>13}" for m in by_step)]
     first = 0 if "model" in methods else summary["n_encoded_steps"]
     for step in range(first, summary["n_encoded_steps"] + summary["n_future_steps"]):
         kind = "given" if step < summary["n_encoded_steps"] else "predicted"
         numbers = [_number(summary["by_step"][f"{_prefix(methods[0])}{m}"][step], m) for m in by_step]
-        lines.append(f"{f'{step:4d} {kind}':34}" + "".join(f"{number:>13}" for number in numbers))
+        lines.append(f"{f'{step:4d} {kind}':{width}}" + "".join(f"{number:>13}" for number in numbers))
     lines += physics_table(summary)
     extra = notes(summary)
     return "\n".join([*lines, *([""] if extra else []), *extra])

@@ -18,7 +18,7 @@ from gsim3d.evaluate.physics import (
     shape_change,
     true_states,
 )
-from gsim3d.evaluate.report import physics_table, summarize
+from gsim3d.evaluate.report import physics_table, summarize, table
 from gsim3d.evaluate.scoring import SceneScores
 from gsim3d.state import DYNAMIC, FROZEN, Particles
 from tests.data.made_scenes import edit_json
@@ -174,3 +174,9 @@ def test_report_shows_formulas_and_steps():
     assert "| momentum [m/s] | model | 0.000 | 2.000 | 3.000 |" in text and "|<v>|" in text
     assert "| penetration [m] | model | - | - | - |" in text
     assert physics_table({**summary, "physics": {}}) == []
+
+
+def test_columns_stand_below_each_other():
+    values = {name: {"psnr": torch.ones(6).double()} for name in ("copy", "spring-gaus-given-object")}
+    lines = table(summarize([SceneScores("a", 2, 6, values, {}, {})])).splitlines()
+    assert len({len(line) for line in lines if line.endswith(("1.00", "PSNR"))}) == 1
