@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
+import yaml
 
 from gsim3d import pretrained
 from gsim3d.errors import InputError
@@ -121,6 +122,14 @@ def test_state_becomes_simulator_with_card(scored, package, tmp_path):
     assert (tmp_path / f"{NAME}.png").is_file() and (tmp_path / f"{NAME}-frames.png").is_file()
     package.main([NAME, *paths])  # keeps the limitations
     assert (folder / "README.md").read_text() == text
+    described, measured = (json.loads((folder / name).read_text()) for name in ("recipe.json", "scores.json"))
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    config["model"]["dynamics"]["actions"] = ["pusher"]
+    acting = package.card(NAME, described, measured, config, "- It floats.\n")
+    assert (
+        "actors" not in text
+        and "\n- Input: positions of its actors at all steps, also of the future: pusher.\n" in acting
+    )
 
 
 def test_scores_of_other_weights_are_refused(scored, package, tmp_path):

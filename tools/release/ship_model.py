@@ -102,6 +102,8 @@ def card(name: str, recipe: dict, scores: dict, config: dict, limitations: str) 
     world, begun = recipe["world"], recipe["runs"][0].get("began_with")
     n_runs, n_scored = len(recipe["runs"]), sum(scores[s]["n_scenes"] for s in SETS if s in scores)
     before = f"\n- Initial weights: `{begun['name']}` at step {begun['step']:,}." if begun else ""
+    actors = ", ".join(config["model"]["dynamics"].get("actions") or ())
+    known = f"\n- Input: positions of its actors at all steps, also of the future: {actors}." if actors else ""
     put = "".join(f"\n- Changed after training: {run['then']}." for run in recipe["runs"] if "then" in run)
     return f"""# {name}
 
@@ -114,7 +116,7 @@ Research on learned simulation, and a start for training on similar scenes. Not 
 ## Inputs and outputs
 
 - Input: {data["history"]} steps from {data["context_views"]} calibrated cameras at {world["image_size"]} pixels,
-  with masks, {world["fps"]:g} frames a second.
+  with masks, {world["fps"]:g} frames a second.{known}
 - Output: particles of every later step, rendered as 3D Gaussians from any camera.
 - Dynamics: {recipe["dynamics"]}.
 
