@@ -242,6 +242,8 @@ class Actions(TensorRecord):
         Raises:
             InputError: shapes do not fit, or a position is not finite; names scene and step.
         """
+        if isinstance(types, str):
+            raise InputError(f"actions: types must be a list, one name for each point; got {types!r}")
         wanted = positions.dim() == 4 and positions.shape[1] > 0 and positions.shape[2:] == (len(types), 3)
         if not wanted or not positions.is_floating_point():
             got = f"{positions.dtype} {list(positions.shape)}"

@@ -36,7 +36,7 @@ class TaskEnv(gymnasium.Env):
     - ``particles`` [256, 3]: points of the bodies, metres; the same points at every step;
     - ``images`` uint8 [4, H, W, 3]: of four calibrated cameras (``rig``).
 
-    Episodes are functions of the seed and equal in all bits.
+    Episodes are functions of the seed, in all bits; those of a learned simulator for one machine and number of threads.
 
     Args:
         observation: "particles", "images" or "both".

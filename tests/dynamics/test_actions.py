@@ -228,6 +228,8 @@ def test_wrong_actions_are_refused():
     positions = torch.zeros(2, 4, 2, 3)
     with pytest.raises(InputError, match=r"positions must be float .B, T, 1, 3.; got torch.float32 .2, 4, 2, 3."):
         Actions.of(positions, ("hand",))
+    with pytest.raises(InputError, match="types must be a list, one name for each point; got 'ab'"):
+        Actions.of(positions, "ab")
     positions[1, 2, 0, 1] = torch.nan
     with pytest.raises(InputError, match="positions of scene 1, step 2 must be finite"):
         Actions.of(positions, TYPES)
