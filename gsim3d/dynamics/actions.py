@@ -55,8 +55,7 @@ class ActionParticles(nn.Module):
         index = self._index(actions, acting)
         (now, types), (coming, coming_types) = actions.at(table), actions.at(table, 1)
         now, types = now.to(like), index[types]
-        stays = (coming_types < 0)[..., None]
-        moved = (torch.where(stays, 0, coming.to(like) - now) / self.cell)[..., None]
+        moved = (torch.where((coming_types < 0)[..., None], 0, coming.to(like) - now) / self.cell)[..., None]
         latents = self.embedding[types.clamp_min(0)] + (moved * self.displacement).sum(-2)
         latents = latents.flatten(0, 1).to(history.dynamic_latents)
         known = table.with_counts((actions.n_points,) * len(table))

@@ -134,8 +134,7 @@ class Actors:
 def _checked(actor: Actor, number: int, n_scenes: int, n_steps: int) -> Tensor:
     """Displacements of an actor [B, T, 3]. Errors name its number."""
     given, where = actor.displacements, f"actors[{number}].displacements"
-    if given.dim() == 2:
-        given = given.expand(n_scenes, *given.shape)
+    given = given.expand(n_scenes, *given.shape) if given.dim() == 2 else given
     if given.dim() != 3 or given.shape[0] != n_scenes or given.shape[2] != 3:
         raise InputError(f"{where} must be [T, 3] or [{n_scenes}, T, 3]; got {list(actor.displacements.shape)}")
     if given.shape[1] < n_steps:
