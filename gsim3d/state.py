@@ -12,7 +12,7 @@ import dataclasses
 import functools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import accumulate
+from itertools import accumulate, pairwise
 
 import torch
 from torch import Tensor
@@ -128,24 +128,42 @@ def take_runs(x: Tensor, runs: Sequence[tuple[int, int]]) -> Tensor:
 
 
 def split_rows(x: Tensor, runs: Sequence[tuple[int, int]]) -> list[Tensor]:
-    """Returns views of the rows of each of ``runs``.
+    """Returns views of the rows of each of ``runs``, which must not be modified."""
+    ascends = all(a[1] <= b[0] for a, b in pairwise(runs))
+    if ascends and x.requires_grad and torch.is_grad_enabled() and not torch.compiler.is_compiling():
+        return list(_Pieces.apply(x, runs))
+    return [x[begin:until] for begin, until in runs]
 
-    Ascending runs are made by one ``split``, whose backward pass concatenates gradients once; slices would add one
-    zero-padded gradient of the size of ``x`` each.
-    """
-    sizes, wanted, end = [], [], 0
-    for begin, until in runs:
-        if begin < end:
-            return [x[begin:until] for begin, until in runs]
-        sizes += [begin - end] if begin > end else []
-        wanted.append(len(sizes))
-        sizes.append(until - begin)
-        end = until
-    sizes += [x.shape[0] - end] if x.shape[0] > end else []
-    if len(sizes) < 2:
-        return [x[begin:until] for begin, until in runs]
-    pieces = x.split(sizes)
-    return [pieces[i] for i in wanted]
+
+class _Pieces(torch.autograd.Function):
+    """Rows of ascending ``runs``. The backward pass concatenates their gradients and zeros once; slices would add one
+    zero-padded gradient of the size of ``x`` each, and ``split`` would store the zeros of each piece."""
+
+    @staticmethod
+    def forward(ctx, x: Tensor, runs: Sequence[tuple[int, int]]) -> tuple[Tensor, ...]:
+        ctx.set_materialize_grads(False)
+        ctx.shape, ctx.runs = x.shape, runs
+        return tuple(x[begin:until] for begin, until in runs)
+
+    @staticmethod
+    def backward(ctx, *grads: Tensor | None) -> tuple[Tensor | None, None]:
+        known = [(run, grad) for run, grad in zip(ctx.runs, grads, strict=True) if grad is not None]
+        if not known:
+            return None, None
+        pieces, end = [], 0
+        for (begin, until), grad in known:
+            zero = cached_zero(grad.dtype, grad.device)
+            pieces += [zero.expand(begin - end, *ctx.shape[1:]), grad]
+            end = until
+        pieces.append(zero.expand(ctx.shape[0] - end, *ctx.shape[1:]))
+        pieces = [piece for piece in pieces if len(piece)] or pieces[:1]
+        return torch.cat(pieces) if len(pieces) > 1 else pieces[0], None
+
+
+@functools.cache
+def cached_zero(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Returns a scalar 0 that no launch fills."""
+    return torch.zeros((), dtype=dtype, device=device)
 
 
 @dataclass(frozen=True)
@@ -460,6 +478,18 @@ def last_steps(particles: Particles, n_steps: int) -> Particles:
     """Returns the particles of the last ``n_steps`` clouds of each scene."""
     kept = _last(particles.clouds.scenes, particles.clouds.steps, n_steps)
     return particles if len(kept) == particles.n_clouds else particles.select_clouds(kept)
+
+
+class Newest:
+    """``last_steps(particles, 1)``, selected in the first call."""
+
+    def __init__(self, particles: Particles):
+        self._particles, self._newest = particles, None
+
+    def __call__(self) -> Particles:
+        if self._newest is None:
+            self._newest = last_steps(self._particles, 1)
+        return self._newest
 
 
 def with_attribute(particles: Particles, name: str, width: int = 3) -> Particles:

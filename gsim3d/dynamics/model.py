@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 
 import torch
@@ -27,11 +27,13 @@ from gsim3d.state import (
     ASLEEP,
     FROZEN,
     CloudTable,
+    Newest,
     Particles,
     concatenate,
     constant,
     newest_clouds,
     single_steps,
+    take_runs,
     with_attribute,
 )
 
@@ -85,12 +87,13 @@ class Dynamics(nn.Module):
         curves = self._draw_curves(generator) if curves is None else curves
         options = {"curves": curves, "capacity": capacity, "rounded": rounded}
         seen, cu_rows, chosen = self._seen(history), history.cu_rows, None
-        places = torch.where(seen[:, None], history.means.detach(), torch.nan)
+        places = history.means.detach()
         if capacity is not None:
             options["capacity"] = capacity = capacity.of_rows(history.n_rows)
         if capacity is not None and capacity.sizes[0] < history.n_rows:
-            chosen, cu_rows, is_row, n_seen = _seen_first(seen, cu_rows, capacity.sizes[0])
-            places = torch.where(is_row[:, None], places[chosen], torch.nan)
+            chosen, cu_rows, seen, n_seen = _seen_first(seen, cu_rows, capacity.sizes[0])
+            places = places[chosen]
+        places = torch.where(seen[:, None], places, torch.nan)
         clouds = history.cloud_scene, constant(slots, cu_rows.device), history.origin
         pyramid = ops.build_pyramid(places, cu_rows, *clouds, self.config.pyramid_spec(history_bits), **options)
         return pyramid if chosen is None else pyramid.of_rows(chosen, n_seen)
@@ -159,6 +162,7 @@ class Dynamics(nn.Module):
         pyramid: Pyramid | None = None,
         background: FrozenContext | None = None,
         changes: Mapping[str, str] | None = None,
+        newest: Newest | None = None,
     ) -> Particles:
         """Predicts the next ``config.steps_per_call`` steps of every scene.
 
@@ -170,6 +174,7 @@ class Dynamics(nn.Module):
             background: context of the static particles, from :meth:`remember`; ``history`` then holds the moving
                 particles of a :class:`Partition`. None: computed here if ``config.background="asymmetric"``.
             changes: attributes that a step changes, from ``layout.changes``; None: all predicted attributes.
+            newest: of ``history``; None: made here.
         Returns:
             One cloud a scene and step, with the particles of the scene's newest step.
         Gradients:
@@ -181,20 +186,21 @@ class Dynamics(nn.Module):
         changes = changes or self.layout.changes()
         if background is None and self.config.is_asymmetric:
             return self._forward_in_parts(history, generator, changes)
-        history = self._with_initial_latents(self.begin(history), changes)
+        begun = self.begin(history)
+        newest = newest if newest is not None and begun is history else Newest(begun)
+        history = self._with_initial_latents(begun, changes)
         if pyramid is None:
             curves = None if background is None else background.curves
             rounded = background is None and self._rounds(history)
             pyramid = self.geometry(history, generator=generator, curves=curves, rounded=rounded)
-        ctx = self.context(history, changes)
+        ctx = self.context(history, changes, partial(self._state, history, newest))
         outputs, gains = self._predict(ctx, pyramid, generator, background)
         displacements = self.layout.displacements(ctx.state, outputs)
         if any(prior.acts for prior in self.priors) and not ctx.is_empty:
             displacements = self._move(ctx, displacements[0], gains)[None]
         steps = self.layout.advance(ctx.state, outputs, displacements, ctx.awake, changes)
-        if not ctx.is_empty:
-            for prior in self.priors:
-                steps = [prior.finish(step, gains.get(prior.name), ctx) for step in steps]
+        for prior in () if ctx.is_empty else self.priors:
+            steps = [prior.finish(step, gains.get(prior.name), ctx) for step in steps]
         steps = [step.with_clouds(step.clouds.ahead(1 + i)) for i, step in enumerate(steps)]
         return steps[0] if len(steps) == 1 else concatenate(steps)
 
@@ -239,23 +245,39 @@ class Dynamics(nn.Module):
                 if n := getattr(prior, width):
                     made = None if ctx.is_empty else getattr(prior, features)(ctx)
                     columns.append(columns[0].new_zeros(len(columns[0]), n) if made is None else made)
-        return torch.cat(columns, 1)
+        return columns[0] if len(columns) == 1 else torch.cat(columns, 1)
 
-    def context(self, particles: Particles, changes: Mapping[str, str] | None = None) -> StepContext:
-        """The context of priors for a step from ``particles``."""
+    def context(
+        self,
+        particles: Particles,
+        changes: Mapping[str, str] | None = None,
+        state: Callable[[], Particles] | None = None,
+    ) -> StepContext:
+        """The context of priors for a step from ``particles``, of which ``state`` returns the newest."""
         config, most = self.config, self._most_movable
-        sizes = config.grid_size, 2**config.history_bits
-        return StepContext(particles, self.priors, *sizes, most_movable=most, changes=changes, share=self.layout.share)
+        options = {"most_movable": most, "changes": changes, "share": self.layout.share, "state": state}
+        return StepContext(particles, self.priors, config.grid_size, 2**config.history_bits, **options)
 
     def _with_initial_latents(self, history: Particles, changes: Mapping[str, str]) -> Particles:
         """For a relightable background, resets the dynamic latents of frozen particles, and of bodies if their latents
-        change, to their initial values."""
+        change, to their initial values. Those of particles that sleep, which the network does not receive, are then
+        undefined."""
         if not self.config.is_relightable:
             return history
-        bodies = changes["dynamic_latents"] in ("all", "dynamic")
-        reset = ((history.activity == FROZEN) | bodies & (history.activity != ASLEEP))[:, None]
-        latents = torch.where(reset, history.initial_latents, history.dynamic_latents)
+        latents = history.initial_latents.view_as(history.initial_latents)
+        if changes["dynamic_latents"] not in ("all", "dynamic"):
+            latents = torch.where((history.activity == FROZEN)[:, None], latents, history.dynamic_latents)
         return dataclasses.replace(history, dynamic_latents=latents)
+
+    def _state(self, history: Particles, newest: Newest) -> Particles:
+        """The newest particles of :meth:`_with_initial_latents`; those that sleep keep their latents."""
+        particles = newest()
+        if not self.config.is_relightable:
+            return particles
+        clouds = history.clouds
+        latents = take_runs(history.dynamic_latents, clouds.row_runs(newest_clouds(clouds)))
+        latents = torch.where((particles.activity == ASLEEP)[:, None], particles.dynamic_latents, latents)
+        return dataclasses.replace(particles, dynamic_latents=latents)
 
     def _draws(self, generator: torch.Generator | None, device: torch.device) -> torch.Generator | None:
         """The generator in training: ``generator``, or one on ``device`` seeded by it, to avoid device syncs."""

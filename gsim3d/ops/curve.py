@@ -316,9 +316,9 @@ class Pyramid:
             rows: int64, of the input.
             n_rows: int64, how many of the input there should have been; more than ``rows`` do not fit.
         """
-        most = self.found.new_full((), rows.shape[0])
-        problems = self.found[0] | torch.where(n_rows > most, PyramidCapacity.TOO_LARGE, 0)
-        found = torch.cat([torch.stack([problems, torch.maximum(self.found[1], n_rows)]), self.found[2:]])
+        problems, n_found = self.found[:1], n_rows.view(1)
+        problems = problems | PyramidCapacity.TOO_LARGE * (n_found > rows.shape[0])
+        found = torch.cat([problems, torch.maximum(self.found[1:2], n_found), self.found[2:]])
         return dataclasses.replace(self, rows=rows[self.rows], found=found)
 
 

@@ -109,16 +109,18 @@ class StepContext:
         most_movable: int | None = None,
         changes: dict[str, str] | None = None,
         share: Callable[..., Tensor] | None = None,
+        state: Callable[[], Particles] | None = None,
     ):
         self.history, self.priors, self.grid_size, self.max_steps = history, priors, grid_size, max_steps
         self.newest = newest_clouds(history.clouds)
         self.runs = history.clouds.row_runs(self.newest)
         self.changes, self.awake, self.n_views = changes, None, None
         self._most_movable, self._share, self._shared = most_movable, share, {}
+        self._make_state = state or (lambda: history.select_clouds(self.newest))
 
     @property
     def state(self) -> Particles:
-        return self.cached("state", lambda: self.history.select_clouds(self.newest))
+        return self.cached("state", self._make_state)
 
     @property
     def movable(self) -> Movable:

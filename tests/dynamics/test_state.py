@@ -9,7 +9,7 @@ from gsim3d.compat.released_model import ReleasedDynamicsConfig
 from gsim3d.dynamics.step import StateLayout, position_features
 from gsim3d.math.rotations import rotate_left, rotation_matrices
 from gsim3d.priors.base import bounded
-from gsim3d.state import FROZEN
+from gsim3d.state import FROZEN, split_rows
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import EXPLICIT, TINY, advance, float_fields, make_history
 
@@ -34,6 +34,22 @@ def test_channels_of_the_explicit_state():
     packed = layout.pack(particles)
     assert_same_bits(packed[:, :4].contiguous(), particles.sh[:, :, 0].contiguous(), "red harmonics come first")
     assert_same_bits(packed[:, 13:17], particles.quats.roll(-1, 1), "real part last")
+
+
+def test_gradients_of_runs_of_rows():
+    x = torch.arange(24.0, dtype=torch.float64).view(8, 3).requires_grad_()
+    runs = [(1, 3), (3, 3), (4, 5), (6, 7)]
+    weight = torch.rand(8, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+
+    def loss(pieces):  # the last but one has no gradient
+        return sum((weight[a:b] * piece**3).sum() for piece, (a, b) in zip(pieces, runs) if a != 4)
+
+    found, expected = (torch.autograd.grad(loss(f(x)), x, create_graph=True)[0] for f in (
+        lambda x: split_rows(x, runs), lambda x: [x[a:b] for a, b in runs]
+    ))  # fmt: skip
+    assert_same_bits(found, expected)
+    assert_same_bits(*(torch.autograd.grad(first.sum(), x)[0] for first in (found, expected)))
+    assert_same_bits(torch.cat(split_rows(x, runs[::-1])), torch.cat([x[a:b] for a, b in runs[::-1]]))
 
 
 def test_position_features_are_relative_to_origin_and_cell():
