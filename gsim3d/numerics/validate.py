@@ -16,7 +16,7 @@ from gsim3d.errors import InputError, NumericalError
 from gsim3d.numerics.policy import ACTIONS, FARTHEST, LARGEST, StabilityConfig, at_most, usable_pixels
 from gsim3d.numerics.report import Finding, Reading, StabilityReport, Statistics
 from gsim3d.ops.validate_state import CELLS, FAST, OUTSIDE, join_records, validate_state
-from gsim3d.state import ASLEEP, ATTRIBUTES, CloudTable, Particles
+from gsim3d.state import ASLEEP, ATTRIBUTES, CloudTable, Particles, cached_zero
 
 BOUNDED = {"opacities": "outside [0, 1]", "scales": "negative or not finite"}
 ALWAYS = ("means", "opacities")  # validated even if unchanged
@@ -84,15 +84,12 @@ def validate_particles(
     before = None if previous is None else [getattr(previous, name) for name in fields]
     clamps = config.on_invalid == "clamp"
     on_gpu = particles.means.is_cuda and not torch.compiler.is_compiling()  # asynchronous record
-    # The kernel's sanitized copies carry no gradients.
-    in_kernel = not clamps and not (
-        torch.is_grad_enabled() and any(value.requires_grad for value in (*fields.values(), *(before or ())))
-    )
     clouds = {name: getattr(particles, name) for name in ("cloud_scene", "origin", "activity")}
     limits = {"grid_size": grid_size, "previous": before, "max_step": config.max_speed}
-    limits["neutral"] = checks.neutral if in_kernel else None
+    limits["neutral"] = None if clamps else checks.neutral
     options = {**clouds, **limits, "join": not on_gpu, "check": False}
-    validated = validate_state(list(fields.values()), checks.bounds, particles.cu_rows, **options)
+    values = [value.detach() for value in fields.values()]
+    validated = validate_state(values, checks.bounds, particles.cu_rows, **options)
     if not torch.compiler.is_compiling():
         read = partial(_read, particles.clouds, where, checks, previous is not None)
         counts = _count_indices(*validated.record.shape, len(checks.kinds))
@@ -103,10 +100,11 @@ def validate_particles(
             if torch.is_grad_enabled():
                 _validate_gradients(fields.values(), read(validated.record).findings[0], report)
     if validated.fields is not None:
-        return _with_fields(particles, dict(zip(fields, validated.fields)) | {"activity": validated.activity})
+        sanitized = validated.fields
+        if torch.is_grad_enabled():
+            sanitized = _Sanitized.apply(len(fields), validated.status, *fields.values(), *(before or ()), *sanitized)
+        return _with_fields(particles, dict(zip(fields, sanitized)) | {"activity": validated.activity})
     replacements = before or [_neutral(name, particles) for name in fields]
-    if not clamps:
-        return _put_to_sleep(particles, fields, replacements, validated.status)
     given, clamped = zip(fields.items(), replacements, checks.bounds, strict=True), {}
     for (name, value), replacement, (low, high) in given:
         clamped[name] = torch.where(value.isnan(), replacement, value).clamp(low, high)
@@ -254,6 +252,35 @@ def _with_fields(particles: Particles, fields: dict[str, Tensor]) -> Particles:
     return made
 
 
+class _Sanitized(torch.autograd.Function):
+    """The kernel's sanitized copies, with gradients to the values, or to those before of rows that have them.
+
+    ``tensors``: values (positions and opacities first), values before, if any, and copies.
+    """
+
+    @staticmethod
+    def forward(ctx, n: int, status: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
+        ctx.save_for_backward(status)
+        ctx.set_materialize_grads(False)
+        ctx.same = [value is before for value, before in zip(tensors[:n], tensors[n:-n])]
+        return tensors[-n:]
+
+    @staticmethod
+    def backward(ctx, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        (status,), values, before = ctx.saved_tensors, list(grads), [None] * len(ctx.same)
+        stays = status & (OUTSIDE - 1 | FAST) == 0
+        if grads[1] is not None:
+            values[1] = torch.where(status & (OUTSIDE - 1) != 0, cached_zero(grads[1].dtype, grads[1].device), grads[1])
+        for f, grad in enumerate(values):
+            if grad is None or (before and ctx.same[f]):
+                continue
+            rows, zero = stays.reshape(-1, *[1] * (grad.dim() - 1)), cached_zero(grad.dtype, grad.device)
+            values[f] = torch.where(rows, grad, zero)
+            if before:
+                before[f] = torch.where(rows, zero, grad)
+        return None, None, *values, *before, *[None] * len(grads)
+
+
 def _validate_gradients(values: Iterable[Tensor], finding: Finding, report: StabilityReport) -> None:
     """Registers hooks that raise if a gradient behind ``values`` is not finite.
 
@@ -285,20 +312,6 @@ def _neutral(name: str, particles: Particles) -> Tensor:
     if name == "quats":
         neutral[:, 0] = 1
     return neutral
-
-
-def _put_to_sleep(
-    particles: Particles, fields: dict[str, Tensor], replacements: list[Tensor], status: Tensor
-) -> Particles:
-    unusable, stays = status & (OUTSIDE - 1) != 0, status & (OUTSIDE - 1 | FAST) == 0
-    sanitized = {}
-    for (name, value), replacement in zip(fields.items(), replacements, strict=True):
-        if replacement is not value:
-            sanitized[name] = torch.where(stays.reshape(-1, *[1] * (value.dim() - 1)), value, replacement)
-    opacities = sanitized.get("opacities", particles.opacities)
-    sanitized["opacities"] = torch.where(unusable, 0.0, opacities)
-    sanitized["activity"] = torch.where(status == 0, particles.activity, ASLEEP)
-    return dataclasses.replace(particles, **sanitized)
 
 
 def _clamped_means(

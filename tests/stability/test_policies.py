@@ -125,7 +125,7 @@ def test_dropped_particle_gradients_are_zero(simulator, state):
 
 @pytest.mark.parametrize("knows_previous", [False, True])
 def test_sanitized_values_with_and_without_gradients(simulator, state, knows_previous):
-    """The kernel sanitizes without gradients, torch with them."""
+    """Gradients go to the values, and to the previous ones of rows that have them."""
     newest, generator = last_steps(state, 1), torch.Generator().manual_seed(0)
     shapes = {"quats": (4,), "scales": (3,), "sh": (4, 3)}
     explicit = {name: torch.rand(newest.n_rows, *shape, generator=generator) for name, shape in shapes.items()}
@@ -142,7 +142,11 @@ def test_sanitized_values_with_and_without_gradients(simulator, state, knows_pre
     guard = simulator._guard("rollout", "drop", StabilityReport())
     options = {"previous": newest} if knows_previous else {}
     expected = guard(bad, **options)
-    leaves = {name: value.clone().requires_grad_() for name, value in bad.row_fields().items() if name != "activity"}
+    leaves, before = (
+        {name: value.clone().requires_grad_() for name, value in of.row_fields().items() if name != "activity"}
+        for of in (bad, newest)
+    )
+    options = {"previous": dataclasses.replace(newest, **before)} if knows_previous else {}
     actual = guard(dataclasses.replace(bad, **leaves), **options)
     for name, value in expected.row_fields().items():
         assert not value.requires_grad and getattr(actual, name).requires_grad == (name != "activity")
@@ -150,6 +154,17 @@ def test_sanitized_values_with_and_without_gradients(simulator, state, knows_pre
     assert_finite(expected)
     asleep = (expected.activity == ASLEEP).nonzero()[:, 0].tolist()
     assert asleep == [row for row in range(len(cases)) if knows_previous or row != len(cases) - 2]
+    replaced = torch.arange(newest.n_rows, device=newest.means.device) < len(cases) - 2 * (not knows_previous)
+    for name, leaf in leaves.items():
+        value = getattr(actual, name)
+        weight = torch.rand(value.shape, generator=generator).to(value)
+        grads = torch.autograd.grad((weight * value).sum(), [leaf, before[name]], retain_graph=True, allow_unused=True)
+        rows = replaced.reshape(-1, *[1] * (value.dim() - 1))
+        assert_same_bits(grads[0], torch.where(rows, 0, weight))
+        if knows_previous:
+            hidden = torch.arange(len(weight), device=weight.device) < len(cases) - 2
+            shown = torch.where(hidden, 0, weight) if name == "opacities" else weight
+            assert_same_bits(grads[1], torch.where(rows, shown, 0))
 
 
 def test_closed_report_takes_no_records(simulator, state):
