@@ -134,19 +134,25 @@ class StateLayout:
         colours. ``awake``: bool [N], particles that may change, None: all; ``changes``: of :meth:`changes`."""
         changes = changes or self.changes()
         share = self.share(particles, "means", changes["means"], awake)
-        later = {"means": hold(share, particles.means, particles.means + share * displacements)}
+        means = particles.means[None]
+        later = {"means": hold(share, means, means + share * displacements)}
         for name in (name for name in outputs if name != "means"):
             share = self.share(particles, name, changes[name], awake)
             later[name] = self.later_values(name, getattr(particles, name), outputs[name], share)
-        steps = [{name: values[i] for name, values in later.items()} for i in range(self.config.steps_per_call)]
+        # A view of the only step: its gradient is not copied.
+        later = {name: x.unbind() if len(x) > 1 else (x.squeeze(0),) for name, x in later.items()}
+        steps = (dict(zip(later, values)) for values in zip(*later.values(), strict=True))
         return [dataclasses.replace(particles, **step) for step in steps]
 
     @staticmethod
     def share(particles: Particles, name: str, which: str, awake: Tensor | None) -> Tensor:
         """Mask [N, 1] in the dtype of positions: 1 for particles whose attribute ``name`` changes for ``which``."""
-        frozen = particles.activity == FROZEN
-        masks = {"all": torch.ones_like(frozen), "dynamic": ~frozen, "frozen": frozen, "none": torch.zeros_like(frozen)}
-        mask = masks[which] if awake is None else masks[which] & awake
+        activity = particles.activity
+        if which in ("all", "none"):
+            mask = torch.full_like(activity, which == "all", dtype=torch.bool)
+        else:
+            mask = activity == FROZEN if which == "frozen" else activity != FROZEN
+        mask = mask if awake is None else mask & awake
         if name in APPEARANCE and particles.frozen_appearance is not None:
             mask = mask.masked_fill(particles.frozen_appearance, False)
         return mask[:, None].to(particles.means)
@@ -157,8 +163,8 @@ class StateLayout:
         if name == "quats":
             return self._later_quats(newest, predicted, share)
         share = share.reshape(*share.shape[:-1], *(1,) * (newest.dim() - 1))
-        changed = newest + share * self._differences(name, newest, predicted)
-        return hold(share, newest, self._in_range(name, changed))
+        changed = newest[None] + share * self._differences(name, newest, predicted)
+        return hold(share, newest[None], self._in_range(name, changed))
 
     def _differences(self, name: str, newest: Tensor, predicted: Tensor) -> Tensor:
         """Change [S, N, ...] of an attribute from its newest values, for each step."""
@@ -205,7 +211,7 @@ class StateLayout:
         for vectors in (share * predicted).unbind(0):
             later.append(rotate_left(before, vectors))
             before = later[-1] if self.config.predicts == "from_previous" else newest
-        return hold(share, newest, torch.stack(later))
+        return hold(share, newest[None], torch.stack(later))
 
 
 def _flat(name: str, value: Tensor) -> Tensor:

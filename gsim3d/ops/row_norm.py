@@ -99,12 +99,15 @@ def _check(op: str, tensors: dict[str, Tensor], eps: float) -> None:
 
 def _setup(ctx, inputs, output):
     x, weight, _, residual, _, _ = inputs
+    ctx.set_materialize_grads(False)
     ctx.mark_non_differentiable(output[1])
     ctx.save_for_backward(x, weight, output[1])
     ctx.has_residual = residual is not None
 
 
 def _backward(ctx, grad, _grad_stats):
+    if grad is None:
+        return (None,) * 6
     grad_x, grad_weight, grad_bias = torch.ops.gsim3d.row_norm_backward(grad, *ctx.saved_tensors)
     return grad_x, grad_weight, grad_bias, grad if ctx.has_residual else None, None, None
 
