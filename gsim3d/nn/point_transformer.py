@@ -280,13 +280,9 @@ def run_blocks(
     stage: Stage,
     generator: torch.Generator | None,
     context: FrozenContext | None = None,
-    *,
-    for_products: bool = False,
-) -> Tensor:
-    """x behind ``blocks``; the first convolution reads ``conv_input``, the others what the block before them made.
-
-    ``for_products``: only products read the result, so that without gradients it may have their dtype.
-    """
+) -> tuple[Tensor, Tensor]:
+    """x behind ``blocks``, and the same as products and convolutions read it, so that one of them need not round it;
+    the first convolution reads ``conv_input``, the others what the block before them made."""
     x = widened(x)
     for i, block in enumerate(blocks):
         row = i % len(stage.patches)
@@ -294,7 +290,7 @@ def run_blocks(
             x, conv_input = block.advance(x, conv_input, stage, row, generator, context)
         else:
             x = conv_input = block(x, stage, row, conv_input=conv_input, generator=generator, context=context)
-    return conv_input if for_products and len(blocks) > 0 and not torch.is_grad_enabled() else x
+    return x, conv_input if len(blocks) > 0 else x
 
 
 class Stem(nn.Module):
@@ -311,7 +307,7 @@ class Stem(nn.Module):
 
     def forward(self, x: Tensor, stage: Stage, context: FrozenContext | None = None) -> Tensor:
         n = sum(linear.in_features for linear in self._in_projs)
-        x, others = x.split([x.shape[1] - n, n], 1)
+        x, others = x.split([x.shape[1] - n, n], 1) if n else (x, None)
         x = self.conv(x.contiguous(), stage, context)
         if n:
             padding = (0, -n % COLUMN_MULTIPLE)
@@ -359,7 +355,7 @@ class Merge(nn.Module):
 class EncoderStage(nn.Module):
     def __init__(self, index: int, drop_paths: list[float], config: TransformerConfig):
         super().__init__()
-        channels, self.is_last = config.encoder_channels, config.n_stages == 1
+        channels = config.encoder_channels
         self.pool = Pool(channels[index - 1], channels[index], config.norm) if index > 0 else None
         window = config.merge_windows[index - 1] if index > 0 else 1
         n_merged = 2 ** config.pyramid_spec(config.history_bits).merged_bits()[index]
@@ -370,12 +366,12 @@ class EncoderStage(nn.Module):
 
     def forward(
         self, x: Tensor, stage: Stage, generator: torch.Generator | None, context: FrozenContext | None = None
-    ) -> Tensor:
+    ) -> tuple[Tensor, Tensor]:
         if self.pool is not None:
             x = self.pool(x, stage)
         if self.merge is not None and self.merge.marks(stage):
             x = self.merge(x, stage)
-        return run_blocks(self.blocks, x, x, stage, generator, context, for_products=not self.is_last)
+        return run_blocks(self.blocks, x, x, stage, generator, context)
 
 
 class Unpool(nn.Module):
@@ -405,7 +401,6 @@ class DecoderStage(nn.Module):
         self.unpool = Unpool(below, config.encoder_channels[index], channels[index], config.norm)
         heads = config.decoder_heads[index]
         self.blocks = nn.ModuleList(Block(channels[index], heads, rate, config) for rate in drop_paths)
-        self.is_last = index == 0
 
     def forward(
         self,
@@ -415,10 +410,10 @@ class DecoderStage(nn.Module):
         coarse: Stage,
         generator: torch.Generator | None,
         context: FrozenContext | None = None,
-    ) -> Tensor:
+    ) -> tuple[Tensor, Tensor]:
         x = self.unpool(x, skip, coarse)
         conv_input = self.conv_input(x, skip)
-        return run_blocks(self.blocks, x, conv_input, stage, generator, context, for_products=not self.is_last)
+        return run_blocks(self.blocks, x, conv_input, stage, generator, context)
 
     def conv_input(self, x: Tensor, skip: Tensor) -> Tensor:
         """What the first convolution reads."""
@@ -494,15 +489,16 @@ class PointTransformer(nn.Module):
     def _behind_stem(
         self, x: Tensor, pyramid: Pyramid, generator: torch.Generator | None, contexts: Sequence[FrozenContext | None]
     ) -> Tensor:
-        stages, skips = pyramid.stages, []
+        stages, skips, reads = pyramid.stages, [], x
         with Streams(x) as streams:
             for s, (encoder, stage, context) in enumerate(zip(self.encoder, stages, contexts, strict=True)):
-                x = encoder(x, stage, generator, context)
+                # Gradients of two products that read the same are not added in 16 bits.
+                x, reads = encoder(x if torch.is_grad_enabled() else reads, stage, generator, context)
                 if s < len(self.decoder):  # made beside the deeper stages
                     lift = self.decoder[s].unpool.lift
-                    skips.append(lift(x, stage) if torch.is_grad_enabled() else streams.run(lift, x, stage))
+                    skips.append(lift(reads, stage) if torch.is_grad_enabled() else streams.run(lift, reads, stage))
         for s in reversed(range(len(self.decoder))):
-            x = self.decoder[s](x, skips[s], stages[s], stages[s + 1], generator, contexts[s])
+            x, reads = self.decoder[s](reads, skips[s], stages[s], stages[s + 1], generator, contexts[s])
         return x
 
 

@@ -195,12 +195,12 @@ class PointTransformerV3(nn.Module):
         for s, stage in enumerate(stages):
             if s > 0:
                 x = self.pools[s - 1](x, stage)
-            x = run_blocks(self.encoder[s], x, x, stage, generator)
+            x, _ = run_blocks(self.encoder[s], x, x, stage, generator)
             skips.append(x)
         for s in reversed(range(len(self.decoder))):
             skip = self.unpools[s].lift(skips[s], stages[s])
             x = self.unpools[s](x, skip, stages[s + 1])
-            x = run_blocks(self.decoder[s], x, skip, stages[s], generator)  # convolutions first read the skip alone
+            x, _ = run_blocks(self.decoder[s], x, skip, stages[s], generator)  # convolutions first read the skip alone
         return x
 
     def _check(self, x: Tensor, stages: tuple[Stage, ...]) -> None:

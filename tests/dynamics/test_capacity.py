@@ -77,7 +77,7 @@ def test_padding_is_finite_and_changes_no_particle():
     assert_same_bits(features, expected)
     stages = []
     for encoder in dynamics.net.encoder:
-        encoder.register_forward_hook(lambda module, inputs, output: stages.append(output))
+        encoder.register_forward_hook(lambda module, inputs, output: stages.append(output[0]))
     dynamics(history, pyramid=pyramid)
     for stage, x in zip(pyramid.stages, stages, strict=True):
         assert x.shape[0] == stage.n_rows and torch.isfinite(x).all()

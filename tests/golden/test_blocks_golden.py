@@ -69,12 +69,12 @@ def test_pooling(file, stride):
     features = g["in/features"].reshape(first.n_rows, -1)
     close(features, g["point_in/feat"], "features of the rows")
     stage = pooling_stage(g, stride, 1, config)
-    out = stage(features, second, None)
+    out, _ = stage(features, second, None)
     close(out, case["out/feat"], "features", "golden_float32")
     spread = unpool(out.detach(), second.cluster.rows, second.cluster.cu_rows, first.n_rows)
     assert torch.equal(spread, out.detach()[case["out/pooling_inverse"]])
 
-    out = stage.train()(features, second, None)
+    out, _ = stage.train()(features, second, None)
     close(out, case["train/feat"], "features in training", "golden_float32")
     close(stage.pool.norm.running_mean, case["train/running_mean_after"], "running mean", "golden_float32")
     close(stage.pool.norm.running_var, case["train/running_var_after"], "running variance", "golden_float32")
@@ -101,7 +101,7 @@ def test_merging(file, stride, window, device):
     positions = pool_mean(xyz.reshape(-1, 3), second.cluster.rows, second.cluster.cu_rows)
     close(positions, case["out/coord"], "positions", "golden_float32")
     features = g["in/features"].reshape(first.n_rows, -1).to(device)
-    out = pooling_stage(g, stride, window, config).to(device)(features, second, None)
+    out, _ = pooling_stage(g, stride, window, config).to(device)(features, second, None)
     close(out, case["out/feat"], "features", "golden_float32")
 
 
