@@ -12,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 import gc
 import math
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -21,6 +21,8 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+from torch.nn.modules.conv import _ConvNd
 
 from gsim3d.cameras import Frames, TensorRecord
 from gsim3d.cuda_graphs import Captured, fit, fixed_geometry, observing_geometry, of_prepared_state
@@ -28,7 +30,8 @@ from gsim3d.dynamics import DynamicsConfig, concatenate
 from gsim3d.effects.plan import Plan
 from gsim3d.errors import CaptureError, InputError
 from gsim3d.io.checkpoint import laid_out_as
-from gsim3d.nn.multiview_encoder import StaticShapes
+from gsim3d.nn.layers import RowLinear
+from gsim3d.nn.multiview_encoder import Encoder, StaticShapes
 from gsim3d.numerics.report import StabilityReport
 from gsim3d.ops import PyramidCapacity
 from gsim3d.ops.curve import Pyramid
@@ -245,8 +248,12 @@ class _Step:
 
     def _encode(self, report: StabilityReport) -> Particles:
         owner = self._owner
+
+        def encode(context: Frames) -> Particles:
+            with _rounded(owner.simulator.encoder):
+                return owner.simulator.encode(context, shapes=self._shapes, report=report)
+
         with owner.precision("encoder"):
-            encode = partial(owner.simulator.encode, shapes=self._shapes, report=report)
             state = owner.again("encoder")(encode)(self._context)
         return with_views(state, self._context, self._shapes) if owner.leaves_out else state
 
@@ -278,7 +285,7 @@ class _Step:
 
         def with_own_weights(predict: Callable[[Particles], Particles]) -> Callable[[Particles], Particles]:
             def call(state: Particles) -> Particles:
-                with _aliased(dynamics) as aliases:
+                with _replaced(dynamics.modules(), _aliases) as aliases:
                     of_calls.append(aliases)
                     return owner.again("steps")(geometry.in_call(len(of_calls), predict))(state)
 
@@ -388,25 +395,51 @@ class _OfCalls:
 
 
 @contextmanager
-def _aliased(module: nn.Module) -> Iterator[list[Tensor]]:
-    """Replaces the parameters of ``module`` by aliases of the same memory; yields them in order of ``parameters()``.
-
-    Gradients of aliases are added by a few multi-tensor kernels instead of thousands, call by call.
-    """
-    owners = [
-        (part, name, value)
-        for part in module.modules()
-        for name, value in part._parameters.items()
-        if value is not None
-    ]
-    aliases = [value.detach().requires_grad_() for _, _, value in owners]
+def _replaced(modules: Iterable[nn.Module], make: Callable[[list[Tensor]], Sequence[Tensor]]) -> Iterator:
+    """Replaces the parameters of ``modules`` by what ``make`` returns for them; yields it, in their order."""
+    owners = [(of, name, value) for of in modules for name, value in of._parameters.items() if value is not None]
+    made = make([value for *_, value in owners])
     try:
-        for (part, name, _), alias in zip(owners, aliases, strict=True):
-            part._parameters[name] = alias
-        yield aliases
+        for (part, name, _), value in zip(owners, made, strict=True):
+            part._parameters[name] = value
+        yield made
     finally:
         for part, name, value in owners:
             part._parameters[name] = value
+
+
+def _aliases(values: Sequence[Tensor]) -> list[Tensor]:
+    """The same memory. Gradients of aliases are added by a few multi-tensor kernels instead of thousands, call by
+    call."""
+    return [value.detach().requires_grad_() for value in values]
+
+
+def _rounded(encoder: Encoder) -> AbstractContextManager:
+    """Replaces weights by those that ``torch.autocast`` would round one by one, rounded by one operation."""
+    device = next(encoder.parameters()).device.type
+    if encoder.config.backbone == "vit_dpt" or not torch.is_autocast_enabled(device):  # the former is float32 in parts
+        return nullcontext()
+    products = (p for p in encoder.modules() if isinstance(p, (nn.Linear, _ConvNd)) and not isinstance(p, RowLinear))
+    return _replaced(products, lambda values: _Rounded.apply(torch.get_autocast_dtype(device), *values))
+
+
+class _Rounded(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, dtype: torch.dtype, *values: Tensor) -> tuple[Tensor, ...]:
+        ctx.set_materialize_grads(False)
+        return tuple(_in_dtype(values, dtype))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        wide = iter(_in_dtype([grad for grad in grads if grad is not None], torch.float32))
+        return None, *(grad if grad is None else next(wide) for grad in grads)
+
+
+def _in_dtype(values: Sequence[Tensor], dtype: torch.dtype) -> list[Tensor]:
+    copies = [torch.empty_like(value, dtype=dtype) for value in values]
+    torch._foreach_copy_(copies, list(values))
+    return copies
 
 
 def _sums(by_call: Sequence[Sequence[Tensor | None]]) -> list[Tensor | None]:

@@ -3,6 +3,8 @@
 import dataclasses
 import itertools
 import json
+from contextlib import nullcontext
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,11 +17,12 @@ from gsim3d.data import Scene, find_scenes
 from gsim3d.errors import CaptureError, InputError
 from gsim3d.evaluate.ablations import changed, load_ablations
 from gsim3d.numerics.report import StabilityReport
+from gsim3d.train import captured as captured_module
 from gsim3d.train.captured import CapturedLoss
 from gsim3d.train.config import DataConfig, PhaseConfig, TrainConfig
 from gsim3d.train.loop import Trainer, deterministic
 from gsim3d.train.samples import draw_batch
-from tests.asserts import assert_close_relative_to_max
+from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.tiny_scenes import write_scenes
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -385,6 +388,25 @@ def test_weights_are_read_anew(scenes, trainer, device):
     other, _ = trainer.loss(batch)
     assert run(captured, batch, trainer).loss.item() == pytest.approx(other.item(), rel=TOLERANCE[device.type])
     assert abs(other.item() / once - 1) > 1e-4
+
+
+def test_weights_that_are_rounded_at_once_change_no_bit(scenes, trainer, device, monkeypatch):
+    batch, seen, found = batches(scenes, 1)[0].to(device), [], []
+    convolution = next(part for part in trainer.simulator.encoder.modules() if isinstance(part, torch.nn.Conv2d))
+    convolution.register_forward_pre_hook(lambda part, _: seen.append(part.weight.dtype))
+    one_by_one = partial(torch.autocast, device.type, torch.bfloat16)
+    for rounded in (captured_module._rounded, lambda _: nullcontext()):
+        monkeypatch.setattr(captured_module, "_rounded", rounded)
+        captured = captured_loss(trainer)
+        captured.precision = lambda part: one_by_one(enabled=part == "encoder")
+        with deterministic():
+            found.append(run(captured, batch, trainer))
+    assert {*seen[: len(seen) // 2]} == {torch.bfloat16} and {*seen[len(seen) // 2 :]} == {torch.float32}
+    assert_same_bits(found[0].loss, found[1].loss)
+    for name, *both in zip(trainer.parameters, *(result.parameters for result in found), strict=True):
+        assert (both[0] is None) == (both[1] is None), name
+        if both[0] is not None:
+            assert_same_bits(*both, name)
 
 
 def test_captured_training_equals_eager(scenes, tmp_path, device):
