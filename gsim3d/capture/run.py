@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import shlex
 import shutil
 import tempfile
@@ -112,9 +113,10 @@ class _Run:
     say: Callable[[str], None]
 
     def check_same(self) -> None:
-        """Raises InputError if the run folder belongs to other films or settings."""
-        depth = list(self.depth) if self.depth else None
-        given = {"DIR": str(self.folder.resolve()), "device": self.device, "minutes": self.minutes, "depth": depth}
+        """Raises InputError if the run folder belongs to other films or settings; both may have moved together."""
+        depth = [self.depth[0], Path(self.depth[1]).name] if self.depth else None
+        films = os.path.relpath(self.folder.resolve(), self.out.resolve())
+        given = {"DIR": films, "device": self.device, "minutes": self.minutes, "depth": depth}
         file = self.out / "capture.json"
         before = read_json(file) if file.is_file() else given
         if changed := [key for key in given if before.get(key) != given[key]]:
