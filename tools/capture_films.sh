@@ -1,12 +1,18 @@
 #!/usr/bin/env bash
 # Degraded films of generated scenes -> simulators by plane sweep and from pretrained depth -> docs/results/captures.
 #   bash tools/capture_films.sh runs/films cuda 15 ~/.cache/gsim3d/weights/dinov2_small.safetensors
-# An interrupted call continues: `timeout 540 bash tools/capture_films.sh ...` until the table is printed.
+# An interrupted call continues: `timeout 540 bash tools/capture_films.sh ...` until the table is printed. More arguments:
+# scenes of each film set, folder of the scores, and names of the sets to capture (default: all).
 set -euo pipefail
 cd "$(dirname "$0")/.."
 out=${1:-runs/films} device=${2:-cpu} minutes=${3:-15} weights=${4:-}
 scenes=${5:-24} results=${6:-docs/results/captures}
-films=("elastic elastic 0 1 2" "rigid rigid 0 1 2" "cloth cloth 0 1 2" "held_out_camera elastic 0 1 2 3")
+names=" ${*:7} "
+[ "$names" != "  " ] || names=" elastic rigid cloth held_out_camera "
+films=()
+for words in "elastic elastic 0 1 2" "rigid rigid 0 1 2" "cloth cloth 0 1 2" "held_out_camera elastic 0 1 2 3"; do
+  [[ $names != *" ${words%% *} "* ]] || films+=("$words")
+done
 
 film() { # NAME WORLD CAMERA ...
   [ -f "$out/$1/films/truth.json" ] && return
