@@ -40,7 +40,8 @@ def overlap_problem(names: tuple[str, ...], found: np.ndarray) -> str | None:
 def match_errors(scene: Scene, found: np.ndarray) -> dict[str, tuple[float, int]]:
     """Measures the calibration by features that neighbouring cameras share.
 
-    Matches that agree with some fundamental matrix are triangulated with the given cameras.
+    Features that are each other's best match, and agree with some fundamental matrix, are triangulated with the given
+    cameras.
 
     Args:
         scene: its first step is used.
@@ -59,13 +60,11 @@ def match_errors(scene: Scene, found: np.ndarray) -> dict[str, tuple[float, int]
     for a, b in zip(*np.nonzero(np.triu(found <= MAX_ANGLE, 1)), strict=True):
         if any(features[cam][1] is None for cam in (a, b)):
             continue
-        pairs = cv2.BFMatcher().knnMatch(features[a][1], features[b][1], 2)
-        good = [pair[0] for pair in pairs if len(pair) == 2 and pair[0].distance < RATIO * pair[1].distance]
+        (of_a, one), (of_b, other) = features[a], features[b]
+        good = sorted(_best(one, other) & {pair[::-1] for pair in _best(other, one)})  # few of repeated patterns
         if len(good) < MIN_MATCHES:
             continue
-        pixels = [
-            np.float64([features[cam][0][m.queryIdx if cam == a else m.trainIdx].pt for m in good]) for cam in (a, b)
-        ]
+        pixels = [np.float64([of[k].pt for k in own]) for of, own in zip((of_a, of_b), zip(*good), strict=True)]
         _, agrees = cv2.findFundamentalMat(*pixels, cv2.USAC_MAGSAC, 1.0, 0.999, 5000)
         agrees = np.zeros(len(good), bool) if agrees is None else agrees.ravel() > 0
         if agrees.sum() < MIN_MATCHES:
@@ -78,6 +77,12 @@ def match_errors(scene: Scene, found: np.ndarray) -> dict[str, tuple[float, int]
         names = scene.camera_names
         errors[f"{names[a]}-{names[b]}"] = float(np.median(np.mean(off, 0))), int(agrees.sum())
     return errors
+
+
+def _best(a: np.ndarray, b: np.ndarray) -> set[tuple[int, int]]:
+    """Returns pairs of each descriptor in ``a`` with its nearest in ``b``, where the second-best is much further."""
+    pairs = (pair for pair in cv2.BFMatcher().knnMatch(a, b, 2) if len(pair) == 2)
+    return {(best.queryIdx, best.trainIdx) for best, second in pairs if best.distance < RATIO * second.distance}
 
 
 def fit_problem(errors: dict[str, tuple[float, int]], width: int) -> str | None:

@@ -20,6 +20,7 @@ from gsim3d.nn.multiview_encoder.config import ViTConfig
 from gsim3d.train.restore import restore
 from tests.capture.made_films import rig, write_textured_films
 from tests.capture.made_takes import cameras_at, write_take
+from tests.data.made_hocap import write_hocap
 
 
 @pytest.fixture(scope="module")
@@ -166,6 +167,12 @@ def test_a_wrong_camera_is_refused_by_the_error_of_matches(tmp_path):
     turn = cv2.Rodrigues(np.array([0.04, 0.0, 0.0]))[0]
     entries[1] |= {key: (turn @ np.array(entries[1][key])).tolist() for key in ("R", "T")}
     assert "does not fit" in problem() and "cam0-cam1" in problem() and "px" in problem()
+
+
+def test_a_floor_of_equal_tiles_does_not_refuse_a_calibration(tmp_path):
+    scene = Scene.open(write_hocap(tmp_path, n_frames=2))
+    errors = check.match_errors(scene, check.angles(scene.recording.viewmats[0]))
+    assert errors and check.fit_problem(errors, scene.width) is None
 
 
 def test_force_goes_on_and_keeps_what_was_ignored(tmp_path):
