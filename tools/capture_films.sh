@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Degraded films of generated scenes -> simulators by plane sweep and from pretrained depth -> docs/results/captures.
 #   bash tools/capture_films.sh runs/films cuda 15 ~/.cache/gsim3d/weights/dinov2_small.safetensors
-# An interrupted call continues: `timeout 540 bash tools/capture_films.sh ...` until the table is printed. More arguments:
-# scenes of each film set, folder of the scores, and names of the sets to capture (default: all).
+# An interrupted call continues: `timeout 540 bash tools/capture_films.sh ...` until the table is printed. Further
+# arguments: scenes of a set of films, folder of the scores, names of the sets to capture (default: all).
 set -euo pipefail
 cd "$(dirname "$0")/.."
 out=${1:-runs/films} device=${2:-cpu} minutes=${3:-15} weights=${4:-}
