@@ -193,7 +193,7 @@ class ModelScenes(Scenes):
             kept[frozen] = torch.cdist(particles.means[frozen, :2], moving).amin(1) <= reach
         copies._rows = kept[newest_mask(particles)].cumsum(0)[self._rows] - 1
         particles = particles.select_rows(kept)
-        copies.count, copies.state = count, ModelState(_tiled(particles, count), state.actors.expand(count, -1, -1, -1))
+        copies.count, copies.state = count, ModelState(tiled(particles, count), state.actors.expand(count, -1, -1, -1))
         for name in ("_rows", "_members", "_rest", "_centers"):
             value = getattr(copies, name)
             setattr(copies, name, value.expand(count, *value.shape[1:]))
@@ -331,14 +331,26 @@ def _product(a: Tensor, b: Tensor) -> Tensor:
     return (a[..., None] * b[..., None, :, :]).sum(-2)
 
 
-def _tiled(particles: Particles, count: int) -> Particles:
-    """``count`` copies of the one scene of ``particles``."""
+def tiled(particles: Particles, count: int) -> Particles:
+    """``count`` copies of one scene, scenes 0 to ``count - 1`` of the result, to be predicted with different actions.
+
+    Args:
+        particles: state of one scene.
+        count: number of copies.
+
+    Raises:
+        InputError: ``particles`` has several scenes.
+    """
     table = particles.clouds
+    if len(set(table.scenes)) != 1:
+        raise InputError(f"particles must have one scene; got {len(set(table.scenes))}")
+    of = [table.scenes[0]] * count
     scenes, steps = [number for number in range(count) for _ in table.scenes], table.steps * count
     made = CloudTable.make(table.counts * count, scenes, steps, particles.cu_rows.device)
     fields = {name: torch.cat([value] * count) for name, value in particles.row_fields().items()}
-    origin = particles.origin[table.scenes[0]].expand(count, 3)
-    return dataclasses.replace(particles, origin=origin).with_clouds(made, **fields)
+    fields["world_offset"] = None if particles.world_offset is None else particles.world_offset[of]
+    fields["actions"] = particles.actions and particles.actions.select(of)
+    return particles.with_clouds(made, origin=particles.origin[of], **fields)
 
 
 def _cameras(rig: cameras.Rig, image_cloud: Tensor) -> Cameras:

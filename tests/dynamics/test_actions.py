@@ -167,6 +167,25 @@ def test_scenes_of_a_batch_equal_those_alone(name):
     assert frames.actions is None
 
 
+def test_copies_of_a_scene_predict_different_actions():
+    pytest.importorskip("gymnasium", reason="needs gymnasium: pip install 'gsim3d[envs]'")
+    from gsim3d.envs.model import tiled
+
+    simulator, state, first = setting()
+    state = dataclasses.replace(given(state, first), world_offset=torch.ones(1, 3, dtype=torch.float64))
+    others = [walks(state, seed=seed) for seed in (1, 2)]
+    copies = tiled(state, 3)
+    assert torch.equal(copies.actions.positions, first.positions.expand(3, -1, -1, -1))
+    assert copies.world_offset.shape == copies.origin.shape == (3, 3)
+    positions = torch.cat([one.positions for one in (first, *others)])
+    steps = rollout(simulator, given(copies, dataclasses.replace(copies.actions, positions=positions)))
+    for scene, actions in enumerate((first, *others)):
+        for a, b in zip(steps, rollout(simulator, given(state, actions)), strict=True):
+            torch.testing.assert_close(a.select_clouds([scene]).means, b.means)
+    with pytest.raises(InputError, match="particles must have one scene; got 3"):
+        tiled(copies, 2)
+
+
 @pytest.mark.parametrize("name", CONFIGS)
 def test_gradients_flow_to_positions_and_embeddings(name):
     simulator, state, actions = setting(CONFIGS[name])
