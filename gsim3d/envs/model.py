@@ -179,8 +179,8 @@ class ModelScenes(Scenes):
         Raises:
             InputError: these are several scenes.
         """
-        if self.count != 1:
-            raise InputError(f"one scene can be repeated; got {self.count}")
+        if self.count != 1 or state is None:
+            raise InputError(f"one scene can be repeated, after its reset; got {self.count}")
         copies, particles = copy.copy(self), state.particles
         newest, frozen = last_steps(particles, 1), particles.activity == FROZEN
         kept = torch.ones_like(frozen)

@@ -76,6 +76,9 @@ def test_model_needs_weights_of_its_frame_rate(model, tmp_path):
         ThrowToTarget(backend="model")
     with pytest.raises(InputError, match='are of backend="model"'):
         PushToGoal(model=model)
+    scenes = PushToGoal(backend="model", model=model).scenes
+    with pytest.raises(InputError, match="one scene can be repeated, after its reset"):
+        ModelDynamics(scenes)(scenes.state, torch.zeros(2, 3, 2))
     with pytest.raises(InputError, match="backend must be one of"):
         PushToGoal(backend="dream")
     with pytest.raises(InputError, match="trained at 42 frames a second"):
