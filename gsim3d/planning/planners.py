@@ -100,6 +100,7 @@ class Planner(ABC):
         """Forgets earlier plans and restarts the random numbers: the state of a new planner."""
         self._generator = torch.Generator().manual_seed(self._seed)
         self._last = ((self.low + self.high) / 2).expand(self.horizon, -1)
+        self._std = (self.noise * (self.high - self.low)).expand(self.horizon, -1)
 
     def plan(self, state: Any, executed: int = 1) -> Plan:
         """The best sequence of actions from ``state``.
@@ -143,9 +144,6 @@ class Planner(ABC):
         noise = colored_noise(shape, self.color, self._generator).transpose(1, 2).to(mean)
         return torch.cat([mean[None], (mean + std * noise).clamp(self.low, self.high)])
 
-    def _initial_std(self) -> Tensor:
-        return (self.noise * (self.high - self.low)).expand(self.horizon, -1)
-
 
 class MPPI(Planner):
     """Model predictive path integral control: the mean moves to an average of samples, weighted by exp(-cost / T).
@@ -168,7 +166,7 @@ class MPPI(Planner):
         super().__init__(*args, **others)
 
     def _search(self, state: Any, best: _Best, executed: int) -> None:
-        mean, std = best.actions, self._initial_std()
+        mean, std = best.actions, self._std
         for iteration in range(self.iterations):
             sequences = self._sample(mean, std / (iteration + 1))
             costs = self._costs(state, sequences)
@@ -214,7 +212,7 @@ class CEM(Planner):
         self._kept = self.low.new_empty(0, self.horizon, len(self.low))
 
     def _search(self, state: Any, best: _Best, executed: int) -> None:
-        mean, std = best.actions, self._initial_std()
+        mean, std = best.actions, self._std
         kept = _shifted(self._kept, executed)
         count = min(self.samples, max(2, round(self.elite_share * self.samples)))
         for _ in range(self.iterations):
@@ -246,7 +244,7 @@ class GradientDescent(Planner):
         super().__init__(*args, iterations=iterations, **others)
 
     def _search(self, state: Any, best: _Best, executed: int) -> None:
-        sequences = self._sample(best.actions, self._initial_std())
+        sequences = self._sample(best.actions, self._std)
         best.update(sequences, self._costs(state, sequences))
         scale = self.high - self.low
         scaled = (best.actions / scale).detach().clone().requires_grad_()

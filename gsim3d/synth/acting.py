@@ -166,6 +166,11 @@ def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / max(np.linalg.norm(vector), 1e-9)
 
 
+def ramp(x: np.ndarray) -> np.ndarray:
+    x = np.clip(x, 0, 1)
+    return x * x * (3 - 2 * x)
+
+
 def smooth_path(poses: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Path [T, C] through ``poses`` [P, C], whose first three numbers are a place, that rests at each of them.
     ``times`` [T] ascend from 0 to the end of the path at 1; the time between two places is proportional to their
@@ -173,6 +178,5 @@ def smooth_path(poses: np.ndarray, times: np.ndarray) -> np.ndarray:
     lengths = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1) + 1e-9
     ends = np.concatenate([[0.0], np.cumsum(lengths)]) / lengths.sum()
     leg = np.clip(np.searchsorted(ends, times, side="right") - 1, 0, len(lengths) - 1)
-    part = np.clip((times - ends[leg]) / (ends[leg + 1] - ends[leg]), 0, 1)
-    part = (part * part * (3 - 2 * part))[:, None]
+    part = ramp((times - ends[leg]) / (ends[leg + 1] - ends[leg]))[:, None]
     return poses[leg] + part * (poses[leg + 1] - poses[leg])

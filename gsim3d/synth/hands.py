@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsim3d.synth import pushing, scene_setup
-from gsim3d.synth.acting import RESTING, smooth_path
+from gsim3d.synth.acting import RESTING, ramp, smooth_path
 from gsim3d.synth.embedding import ParticleCloud, RigidFrame
 from gsim3d.synth.scene_setup import Unstable, turn_about_z
 from gsim3d.synth.shapes import icosphere
@@ -110,9 +110,9 @@ class Hands(World):
             poses = poses[1:] if len(poses) > 2 else [poses[1], poses[1] + [0.1, 0.1, 0.1, 0.5, 0.0]]
         else:
             poses.append(np.array([*poses[-1][:2], center[2], poses[-1][3], 0.0]))
-        before, after = _ramp((taken - times) / max(taken, FADE)), _ramp((times - left) / (1 - left))
+        before, after = ramp((taken - times) / max(taken, FADE)), ramp((times - left) / (1 - left))
         far = rng.uniform(*AWAY) * np.maximum(before, after)
-        curl = OPEN + (CLOSED - OPEN) * np.minimum(_ramp(1 + (times - taken) / FADE), _ramp(1 + (left - times) / FADE))
+        curl = OPEN + (CLOSED - OPEN) * np.minimum(ramp(1 + (times - taken) / FADE), ramp(1 + (left - times) / FADE))
         path = smooth_path(np.stack(poses), np.clip((times - taken) / (left - taken), 0, 1) if not stays else times)
         policy = CarryPolicy(path, far * (not stays), curl, center, axis, half)
         surfaces = [*drawn.surfaces, pushing.balls(len(TYPES), COLOR)]
@@ -142,11 +142,6 @@ def _hand(curl: float) -> np.ndarray:
             ahead = np.array([np.sin(bend), np.cos(bend) * np.cos(direction), np.cos(bend) * np.sin(direction)])
             points.append(points[-1] + length * ahead)
     return np.stack(points)
-
-
-def _ramp(x: np.ndarray) -> np.ndarray:
-    x = np.clip(x, 0, 1)
-    return x * x * (3 - 2 * x)
 
 
 def _tilt(angle: float) -> np.ndarray:
