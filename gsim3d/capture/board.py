@@ -16,9 +16,10 @@ MAX_VIEWS = 60  # times at which the board is searched
 MIN_CORNERS = 8  # of a view that is used
 MIN_VIEWS = 5  # of each camera
 ITERATIONS = 30
+OUTLIER, MOST_OUTLIERS = 4.0, 0.25  # of the median error of a view, and of the views of a camera
 LOSS_SCALE = 2.0  # pixels; larger residuals are weighted down (Huber)
 MARKER_SHARE = 0.75  # of the square
-OUT_OF_PAPER = np.diag([1.0, -1.0, -1.0])  # axes of a board -> world axes, with z out of the printed side
+OUT_OF_PAPER = np.diag([1.0, -1.0, -1.0, 1.0])  # axes of a board -> world axes, with z out of the printed side
 
 
 @dataclass(frozen=True)
@@ -86,18 +87,18 @@ def calibrate_board(films: Sequence[Film], offsets: Sequence[float], board: Boar
     """
     views = [_intrinsics(film, found) for film, found in zip(films, _detect(films, offsets, board), strict=True)]
     cameras = _initial_poses([film.name for film in films], views)
-    frames = sorted(set().union(*(v.found for v in views)))
     boards = {}
-    for frame in frames:
+    for frame in set().union(*(v.found for v in views)):
         cam = max((c for c, v in enumerate(views) if frame in v.found), key=lambda c: len(views[c].found[frame][0]))
         boards[frame] = np.linalg.inv(cameras[cam]) @ views[cam].found[frame][2]
     cameras, boards, residuals = _adjust(views, cameras, boards)
-    world = boards[frames[-1]]
-    turn = np.eye(4)
-    turn[:3, :3] = OUT_OF_PAPER
+    if any([_drop_outliers(view, own) for view, own in zip(views, residuals, strict=True)]):
+        boards = {frame: pose for frame, pose in boards.items() if any(frame in view.found for view in views)}
+        cameras, boards, residuals = _adjust(views, cameras, boards)
+    world = boards[max(boards)]
     errors = [float(np.sqrt(np.square(np.concatenate(own)).sum(-1).mean())) for own in residuals]
     return [
-        Calibrated(film.name, film.size, v.K, v.distortion, camera @ world @ turn, error, len(v.found))
+        Calibrated(film.name, film.size, v.K, v.distortion, camera @ world @ OUT_OF_PAPER, error, len(v.found))
         for film, v, camera, error in zip(films, views, cameras, errors, strict=True)
     ]
 
@@ -112,22 +113,20 @@ def calm_times(times: np.ndarray, films: Sequence[Film], offsets: Sequence[float
 
 def _detect(films: Sequence[Film], offsets: Sequence[float], board: Board) -> list[dict[int, tuple]]:
     """Returns (object points, pixels) of the board by time, for each camera."""
-    made = board.made()
-    detector = cv2.aruco.CharucoDetector(made)
+    detector = cv2.aruco.CharucoDetector(board.made())
     spans = [film.video.times[[0, -1]] + offset for film, offset in zip(films, offsets, strict=True)]
     low, high = max(span[0] for span in spans), min(span[1] for span in spans)
     if low >= high:
         raise InputError(f"{films[0].video.what}: the films of the board have no time in common")
     times, every = films[0].video.times + offsets[0], []
-    times = times[(times >= low - 1e-6) & (times <= high + 1e-6)]
-    times = calm_times(times, films, offsets)
+    times = calm_times(times[(times >= low - 1e-6) & (times <= high + 1e-6)], films, offsets)
     for film, offset in zip(films, offsets, strict=True):
         own, found = film.video.times + offset, {}
         numbers = np.searchsorted((own[1:] + own[:-1]) / 2, times).tolist()
         for frame, image in enumerate(film.grey(numbers)):
             corners, ids, *_ = detector.detectBoard(image)
             if ids is not None and len(ids) >= MIN_CORNERS:
-                found[frame] = made.matchImagePoints(corners, ids)
+                found[frame] = detector.getBoard().matchImagePoints(corners, ids)
         every.append(found)
     return every
 
@@ -188,6 +187,15 @@ def _adjust(views, cameras, boards):
         view.K, view.distortion = _lens(x[where["lens", cam]])
     cameras = [_matrix(*np.split(x[where["cam", cam]], 2)) for cam in range(len(views))]
     return cameras, {frame: _matrix(*np.split(x[where["board", frame]], 2)) for frame in boards}, residuals
+
+
+def _drop_outliers(view: _Views, residuals: Sequence[np.ndarray]) -> bool:
+    """Removes the few detections whose error is far above the others': frames that a film repeats. Returns if any."""
+    errors = np.array([np.linalg.norm(own, axis=1).mean() for own in residuals])
+    outlier = errors > OUTLIER * np.median(errors)
+    few = 0 < outlier.sum() <= MOST_OUTLIERS * len(errors)
+    view.found = {frame: found for (frame, found), out in zip(view.found.items(), outlier & few) if not out}
+    return bool(few)
 
 
 def _lens(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -151,7 +151,8 @@ class _Run:
             names = [path.name for path in find_scenes(self.folder)]
         except InputError as error:
             raise InputError(f"{error}; and no films <camera>.mp4") from None
-        self.say(f"calibrate: done, or cameras given ({', '.join(names)})")
+        unused = "; --board and --scale have no effect: delete cameras.json to repeat it" if board or scale else ""
+        self.say(f"calibrate: done, or cameras given ({', '.join(names)}){unused}")
 
     def check(self) -> dict:
         """Refuses what cannot be learned from, unless forced."""

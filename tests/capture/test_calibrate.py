@@ -75,6 +75,22 @@ def test_offsets_of_films_reach_the_reader(films):
     assert scene.n_steps == 54 - 5  # those that all three films show
 
 
+def test_frames_that_a_film_repeats_do_not_bend_the_calibration(films, tmp_path):
+    for name in ("cam0", "cam1", "cam2"):
+        frames = list(Video(films / f"{name}.avi", name, SIZE, Problems()).read(range(54), Problems()))
+        for dropped in (9, 10, 21, 22, 33) if name == "cam1" else ():
+            frames[dropped] = frames[dropped - 1]
+        writer = cv2.VideoWriter(str(tmp_path / f"{name}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), FPS, SIZE)
+        for frame in frames:
+            writer.write(frame[..., ::-1])
+        writer.release()
+    calibrate(tmp_path, board=BOARD, say=lambda _: None)
+    entries, poses = cameras_of(tmp_path)
+    assert all(entry["calibration"]["error"] < 0.5 for entry in entries)
+    for found, true in zip(relative(poses), relative([camera[2] for camera in rig()]), strict=True):
+        assert angle(found, true) < 0.5
+
+
 def test_offset_of_one_film_shifts_its_steps(films, tmp_path):
     content = json.loads((films / "cameras.json").read_text())
     for entry in content["cameras"]:

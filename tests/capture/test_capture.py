@@ -41,8 +41,9 @@ def test_capture_ends_with_a_score_and_skips_what_is_done(run, capsys):
     assert scores["steps"] == 2 and len(scores["of_windows"]["constant"]) == scores["windows"]
     before = (run / "model" / "metrics.jsonl").stat().st_mtime_ns
     arguments = ["capture", str(run.parent / "ball"), "--out", str(run), "--minutes"]
-    assert main([*arguments, "0.01"]) == 0
+    assert main([*arguments, "0.01", "--scale", "left", "right", "1"]) == 0
     said = capsys.readouterr().out
+    assert "--board and --scale have no effect: delete cameras.json" in said
     assert all(f"{step}: done" in said for step in ("check", "propose", "settings", "train", "score"))
     assert f"gsim3d view '{run}/scenes/test/ball' --checkpoint '{run}/model'" in said
     assert (run / "model" / "metrics.jsonl").stat().st_mtime_ns == before
