@@ -125,9 +125,8 @@ def time_offsets(times: Sequence[np.ndarray], motions: Sequence[np.ndarray]) -> 
         grid = np.arange(middle[0], middle[-1], step)
         signals.append((middle[0], np.gradient(_smooth(np.interp(grid, middle, np.log1p(values)), GRID))))
     varied = [k for k, own in enumerate(motions) if len(own) >= MIN_FRAMES and own.std() > MIN_VARIATION * own.mean()]
-    pairs = {
-        (a, b): _lag(signals[a][1], signals[b][1], round(MAX_LAG / step)) for a, b in itertools.combinations(varied, 2)
-    }
+    most, among = round(MAX_LAG / step), itertools.combinations(varied, 2)
+    pairs = {(a, b): _lag(signals[a][1], signals[b][1], most) for a, b in among}
     best = np.array([max((r for pair, (_, r, _) in pairs.items() if k in pair), default=0.0) for k in range(n)])
     offsets: dict[int, float] = {}
     while joins := [p for p in pairs if pairs[p][1] >= MIN_AGREEMENT and len(offsets.keys() & p) == bool(offsets)]:
@@ -152,8 +151,6 @@ def _lag(a: np.ndarray, b: np.ndarray, most: int) -> tuple[float, float, float]:
             x, y = a[low:high] - a[low:high].mean(), b[low - lag : high - lag] - b[low - lag : high - lag].mean()
             r = float((x * y).sum() / max(1e-12, np.sqrt((x * x).sum() * (y * y).sum())))
             found.append((lag, r, np.arctanh(min(r, 0.9999)) * np.sqrt(max(1, (high - low) / APART - 3))))
-    if not found:
-        return 0.0, 0.0, 0.0
     top = max(range(len(found)), key=lambda k: found[k][2])
     (lag, r, z), fine = found[top], 0.0
     if 0 < top < len(found) - 1:

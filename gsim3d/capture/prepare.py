@@ -40,7 +40,6 @@ class Proposal:
     size: tuple[int, int]  #: (width, height) of the images in pixels
     #: left, top, width and height of the crop of each camera, in pixels of the working images
     crops: tuple[tuple[int, int, int, int], ...]
-    working_size: tuple[int, int] | None  #: (width, height) of these images; None: as recorded
     bounds: list | None  #: corners [2][3] of the box in which bodies move, metres; None: unknown
     near_far: tuple[float, float]  #: depth range in metres
     body_stride: int  #: every n-th row and column of pixels becomes a particle
@@ -89,7 +88,7 @@ def propose(takes: Sequence[Scene], device: str, say: Callable[[str], None]) -> 
         say(f"  held out: no camera, because {why}")
     else:
         say(f"  held out: camera {first.camera_names[held_out]}, which the others surround best")
-    return Proposal(first.fps, size, tuple(crops), first.fitting.size, bounds, depths, stride, held_out)
+    return Proposal(first.fps, size, tuple(crops), bounds, depths, stride, held_out)
 
 
 def _boxes(takes: Sequence[Scene]) -> tuple[list[tuple], float]:

@@ -167,10 +167,9 @@ class _Run:
             if found.scene.cameras_move:
                 raise InputError(f"{path}: a capture needs cameras that do not move")
             if angles is None:
-                names = found.scene.camera_names
                 angles = check.angles(found.scene.recording.viewmats[0])
-                problems += [check.overlap_problem(names, angles)]
                 errors = {} if found.problems else check.match_errors(found.scene, angles)
+                problems += [check.overlap_problem(found.scene.camera_names, angles)]
                 problems += [check.fit_problem(errors, found.scene.width)]
         problems = [problem for problem in problems if problem]
         nearest = np.where(np.eye(len(angles), dtype=bool), np.inf, angles).min(1)

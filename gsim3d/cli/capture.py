@@ -11,7 +11,7 @@ Steps, each of which prints what it decides and why, writes its result, and is s
   calibrate   cameras.json beside the films (gsim3d calibrate), unless there are cameras
   check       every file, angles between cameras, reprojection error of matched features     OUT/check.json
   propose     frame rate, crop, size, stride, depth range; prepared scenes in OUT/scenes     OUT/proposal.json
-  settings    of the model and its training; steps that fit into --minutes                  OUT/settings.json
+  settings    of the training: steps that fit into --minutes                                 OUT/settings.json
   train       the model in OUT/model; an interrupted training continues                      OUT/train.json
   score       held-out steps against the constant baseline                                   OUT/metrics.json
 

@@ -261,10 +261,8 @@ class _Sequence:
         return local @ pose[:3, :3].T + pose[:3, 3], pixels
 
     def actions(self, cameras: Sequence[Camera]) -> RecordedActions | None:
-        """Returns the joints that are ever known, the median over cameras; adds notes on their absence.
-
-        Short gaps are interpolated. In long ones a joint is absent, and its position is the nearest known.
-        """
+        """Returns the joints that are ever known, by the median over cameras; adds notes. Short gaps are interpolated;
+        in long ones a joint is absent, and its position is the nearest known."""
         positions = np.full((self.n_steps, len(self.types), 3), np.nan)
         for frame in range(self.n_steps if self.types else 0):
             seen = []

@@ -112,9 +112,10 @@ class ViTDepth(nn.Module):
 
     def tokens(self, views: Views) -> Tensor:
         """[I, 4, P, C] of the backbone; of a frozen one scene by scene, so that they do not depend on the batch."""
+        poses = self._geometry(views)[0].to(self.log_scale.dtype)
         if self.config.frozen == "none":
-            return self._tokens(views.images, self._poses(views), views.n_views)
-        parts = zip(views.images.split(views.n_views), self._poses(views).split(views.n_views), strict=True)
+            return self._tokens(views.images, poses, views.n_views)
+        parts = zip(views.images.split(views.n_views), poses.split(views.n_views), strict=True)
         with torch.no_grad():  # copies are aligned, by which matrix products on the CPU choose how they round
             return torch.cat([self._tokens(images.clone(), poses.clone(), views.n_views) for images, poses in parts])
 
@@ -139,9 +140,6 @@ class ViTDepth(nn.Module):
 
     def _geometry(self, views: Views) -> tuple[Tensor, ...]:
         return self.geometry(views) if views.geometry is None else views.geometry.of_depth
-
-    def _poses(self, views: Views) -> Tensor:
-        return self._geometry(views)[0].to(self.log_scale.dtype)
 
     def _tokens(self, images: Tensor, poses: Tensor, n_views: int) -> Tensor:
         read_at = tuple(n * self.config.architecture.patch for n in self.grid(images.shape[2:]))
