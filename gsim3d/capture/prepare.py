@@ -40,7 +40,6 @@ class Proposal:
     size: tuple[int, int]  #: (width, height) of the images in pixels
     #: left, top, width and height of the crop of each camera, in pixels of the working images
     crops: tuple[tuple[int, int, int, int], ...]
-    bounds: list | None  #: corners [2][3] of the box in which bodies move, metres; None: unknown
     near_far: tuple[float, float]  #: depth range in metres
     body_stride: int  #: every n-th row and column of pixels becomes a particle
     held_out_camera: int | None  #: camera that is only a target; None: every camera is an input
@@ -78,9 +77,8 @@ def propose(takes: Sequence[Scene], device: str, say: Callable[[str], None]) -> 
     limit = PARTICLES[device]
     stride = max(1, int(np.ceil(np.sqrt(particles / limit))))
     say(f"  stride: {stride}, so that a step has about {particles / stride**2:.0f} particles (limit {limit})")
-    extent = _extent(takes) if has_masks else None
-    bounds, depths = extent or (None, (first.near, first.far))
-    why = "around the moving bodies" if extent else "of the cameras"
+    around = _depths(takes) if has_masks else None
+    depths, why = (around, "around the moving bodies") if around else ((first.near, first.far), "of the cameras")
     say(f"  depth: {depths[0]:.2f} to {depths[1]:.2f} m, {why}")
     held_out = _held_out_camera(first) if first.n_cams > 3 else None
     if held_out is None:
@@ -88,7 +86,7 @@ def propose(takes: Sequence[Scene], device: str, say: Callable[[str], None]) -> 
         say(f"  held out: no camera, because {why}")
     else:
         say(f"  held out: camera {first.camera_names[held_out]}, which the others surround best")
-    return Proposal(first.fps, size, tuple(crops), bounds, depths, stride, held_out)
+    return Proposal(first.fps, size, tuple(crops), depths, stride, held_out)
 
 
 def _boxes(takes: Sequence[Scene]) -> tuple[list[tuple], float]:
@@ -122,14 +120,14 @@ def _shaped(box: tuple, size: tuple[int, int], image: tuple[int, int]) -> tuple[
     return *corner, *wanted
 
 
-def _extent(takes: Sequence[Scene]) -> tuple[list, tuple[float, float]] | None:
-    """Returns the box [2][3] in which bodies move, and the range of their depths; None if it is unknown.
+def _depths(takes: Sequence[Scene]) -> tuple[float, float] | None:
+    """Returns the range of depths in which bodies move; None if it is unknown.
 
     Of spheres around the point nearest to the rays through the masks' centroids, which stretch less than visual hulls.
     """
     viewmats, Ks = takes[0].recording.cameras_at_step(0)
     centres, _ = positions_and_axes(viewmats)
-    low, high, depths = [], [], []
+    depths = []
     for take in takes:
         for step in evenly_spaced(take.n_steps, SAMPLES):
             masks = (take.segmentation(range(take.n_cams), [step])[0] == MOVING).numpy()
@@ -142,13 +140,11 @@ def _extent(takes: Sequence[Scene]) -> tuple[list, tuple[float, float]] | None:
                 depth = viewmats[seen, 2, :3] @ point + viewmats[seen, 2, 3]
                 spans = [np.quantile(np.linalg.norm(own - m[:2], axis=1), MOST) for own, m in zip(pixels, middles)]
                 radius = np.median(np.array(spans) * depth / Ks[seen, 0, 0])
-                low, high = [*low, point - radius], [*high, point + radius]
                 depths.append((depth.min() - radius, depth.max() + radius))
     if not depths:
         return None
     near, far = (float(np.quantile([d[end] for d in depths], q)) for end, q in ((0, 1 - MOST), (1, MOST)))
-    bounds = [np.quantile(corners, q, 0).tolist() for corners, q in ((low, 1 - MOST), (high, MOST))]
-    return (bounds, (DEPTH_MARGINS[0] * near, DEPTH_MARGINS[1] * far)) if near > 0 else None
+    return (DEPTH_MARGINS[0] * near, DEPTH_MARGINS[1] * far) if near > 0 else None
 
 
 def _held_out_camera(scene: Scene) -> int:
@@ -186,8 +182,6 @@ def write_scene(take: Scene, proposal: Proposal, steps: Sequence[int], folder: P
         pose = {"K": K.tolist(), "R": R.tolist(), "T": T.tolist()}
         cameras.append({"name": name, "size": list(proposal.size), **pose})
     content = {"fps": proposal.fps, "near": proposal.near_far[0], "far": proposal.near_far[1], "cameras": cameras}
-    if proposal.bounds is not None:
-        content["bounds"] = proposal.bounds
     (unfinished / FILE).write_text(json.dumps(content, indent=1))
     shutil.rmtree(folder, ignore_errors=True)
     os.replace(unfinished, folder)

@@ -137,6 +137,10 @@ def test_prepared_scenes_are_cropped_and_synchronised_with_their_cameras(run):
             seen = np.argwhere(mask)[:, ::-1].mean(0) + 0.5
             assert np.linalg.norm(pixel[:2] / pixel[2] - seen) < 1.0
     assert Scene.open(test).n_steps + scene.n_steps == 36 - 1
+    corners = np.array([[x, y, 1] for x in (0, scene.width) for y in (0, scene.height)])
+    for viewmat, K in zip(*scene.recording.cameras_at_step(0), strict=True):  # wherever depth errs, in the workspace
+        local = corners @ np.linalg.inv(K).T * scene.far
+        assert ((local - viewmat[:3, 3]) @ viewmat[:3, :3] >= scene.origin - 1e-6).all()
 
 
 def test_views_far_apart_are_refused_with_their_angles(tmp_path, capsys):
