@@ -484,7 +484,8 @@ class Newest:
     """``last_steps(particles, 1)``, selected in the first call."""
 
     def __init__(self, particles: Particles):
-        self._particles, self._newest = particles, None
+        self._particles = particles
+        self._newest: Particles | None = None
 
     def __call__(self) -> Particles:
         if self._newest is None:
