@@ -38,7 +38,7 @@ def run(tmp_path_factory):
 def test_capture_ends_with_a_score_and_skips_what_is_done(run, capsys):
     scores = json.loads((run / "metrics.json").read_text())
     assert scores["windows"] >= 1 and np.isfinite(scores["gain"])
-    assert scores["steps"] == 2 and len(scores["of_windows"]["constant"]) == scores["windows"]
+    assert scores["steps"] >= 2 and len(scores["of_windows"]["constant"]) == scores["windows"]
     before = (run / "model" / "metrics.jsonl").stat().st_mtime_ns
     arguments = ["capture", str(run.parent / "ball"), "--out", str(run), "--minutes"]
     assert main([*arguments, "0.01", "--scale", "left", "right", "1"]) == 0
