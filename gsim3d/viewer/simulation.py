@@ -207,8 +207,8 @@ class Simulation:
         rows = (particles.activity != FROZEN).nonzero()[:, 0]
         if not len(rows):
             return []
-        body = particles.body  # known where the model segments bodies, along a prediction
-        if body is None:
+        body = particles.body  # known where the model segments bodies, from the newest encoded step on
+        if body is None or torch.equal(body[rows], particles.means[rows]):
             movable = Movable(particles, self._simulator.config.dynamics.grid_size)
             body = segment_bodies(movable, particles, SegmentationConfig())
         _, label, count = torch.unique(body[rows], dim=0, return_inverse=True, return_counts=True)

@@ -93,6 +93,10 @@ def test_bodies_are_found_and_boxes_hold_them_in_the_history(simulation):
         if frame == 3:  # rows of predicted steps are the same particles
             before = target.particles[2].means[bodies[0]]
             assert bool(((before >= low) & (before <= high)).all())
+    known = [len(rows) for rows in simulation.bodies(1)]
+    unknown = dataclasses.replace(target.particles[1], body=target.particles[1].means)  # as of steps before the newest
+    target.replace([target.particles[0], unknown, *target.particles[2:]])
+    assert [len(rows) for rows in simulation.bodies(1)] == known and known[0] > 1
     apart = dataclasses.replace(target.particles[3], body=target.particles[3].means.round())
     target.replace([*target.particles[:3], apart, *target.particles[4:]])
     sizes = [len(rows) for rows in simulation.bodies(3)]
