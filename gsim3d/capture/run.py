@@ -225,8 +225,9 @@ class _Run:
         phase = {"steps": PROBED, "batch": BATCH[device], "warm_up": 0.1}
         phases = [PhaseConfig(horizon=n, learning_rate=rate, **phase) for n, (*_, rate) in zip(horizons, PHASES)]
         model = {"dynamics": {"drop_path": 0.0, "shuffle_orders": False}} if device == "cuda" else {}
+        model["encoder"] = {"latent_limit": 4.0}
         if self.depth:
-            model["encoder"] = {"backbone": "vit_dpt", "vit": {"model": self.depth[0]}}
+            model["encoder"] |= {"backbone": "vit_dpt", "vit": {"model": self.depth[0]}}
         return TrainConfig(
             preset=prepare.PRESETS[device],
             model=model,
