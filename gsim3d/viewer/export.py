@@ -66,8 +66,7 @@ def write_frames(
 ) -> str:
     """Writes ``count`` frames as the file ``to``, as :func:`export` does, with its arguments and errors."""
     out = with_parents(new_output_path(to, "file", "--to"))
-    suffix = out.suffix.lower()
-    if suffix == ".mp4":
+    if (suffix := out.suffix.lower()) == ".mp4":
         if size % 2:
             raise InputError(f"--size must be even for a video; got {size}")
         write_video(out, _orbit(list(frames), fps, size, turns), fps)
@@ -79,10 +78,8 @@ def write_frames(
     else:
         suffix, kind = format_of(out)
         if count > 1 and not kind.has_time:
-            raise InputError(
-                f"{to}: {suffix} holds one frame, and there are {count}: choose one (--frame), or write .html, .usdc "
-                "or .mp4"
-            )
+            instead = "choose one (--frame), or write .html, .usdc or .mp4"
+            raise InputError(f"{to}: {suffix} holds one frame, and there are {count}: {instead}")
         gaussians = list(frames)
         write_splats(out, gaussians if kind.has_time else gaussians[0], fps=fps, up=up)
         what = f"{gaussians[0].means.shape[0]:,} Gaussians, {kind.about}"

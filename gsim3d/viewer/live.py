@@ -208,11 +208,7 @@ class Target:
         """
         if coloring not in self.colorings[1:]:
             raise InputError(f"{self.name} has no colours by {coloring}; it has {', '.join(self.colorings)}")
-        if coloring == "trust":
-            return self._colors_of_trust(frame)
-        if coloring == "velocity":
-            return self._colors_of_velocity(frame)
-        return self._colors_of_activity(frame) if coloring == "activity" else self._colors_of_latents(frame)
+        return getattr(self, f"_colors_of_{coloring}")(frame)
 
     def _colors_of_velocity(self, frame: int) -> Tensor:
         if self._fastest is None:

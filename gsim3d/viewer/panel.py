@@ -80,12 +80,14 @@ class SimulationPanel:
         if self._viewer.timeline.playing:
             raise InputError("pause at the frame that is meant first")
 
+    def _rows(self) -> Any:
+        return self._bodies[self._which.options.index(self._which.value) - len(KINDS)]
+
     def _choose(self) -> None:
         if self._which.value in KINDS:
             return
         self._check_paused()
-        rows = self._bodies[self._which.options.index(self._which.value) - len(KINDS)]
-        low, high = map(np.array, self._simulation.box_of(self._frame, rows))
+        low, high = map(np.array, self._simulation.box_of(self._frame, self._rows()))
         self._middle.value, self._sides.value = tuple((low + high) / 2), tuple(high - low)
         self._inside.value = True
         self._place()
@@ -129,9 +131,12 @@ class SimulationPanel:
             corners = middle - half, middle + half
         made, name = [], self._edit.value
         if name != "none":
-            which = self._which.value if self._which.value in KINDS else "moving"
+            which, body = self._which.value, ()
+            if which not in KINDS:
+                known = self._simulation.target.particles[self._frame].body
+                which, body = "moving", () if known is None else known[self._rows()[0]].tolist()
             vector = np.array(self._color.value) / 255 if name == "recolor" else self._vector.value
-            made = [self._simulation.operation(name, which, vector, corners)]
+            made = [self._simulation.operation(name, which, vector, corners, body)]
         self._viewer.simulate_on(int(self._steps.value), made)
 
     def _measure(self) -> None:

@@ -83,19 +83,18 @@ def write_player(
     header, blobs = _packed(path, splats)
     header |= {"fps": fps, "title": title, "background": list(background), "start": start}
     first = gaussians_of(splats[0], path)
-    view = _around(first) if view is None else view
+    if view is None:
+        camera = camera_around(first, AZIMUTH, POSTER)
+        view = View(camera.viewmats[0].numpy(), camera.Ks[0].numpy(), POSTER, POSTER)
     header["view"], header["antialiased"] = _view(view), first.antialiased
     header["truth"] = _encoded(path, truth) if truth is not None else []
-    scripts = "".join(
-        f'<script type="text/plain" id="blob{index}">{base64.b64encode(blob).decode()}</script>\n'
-        for index, blob in enumerate(blobs)
-    )
+    blob = '<script type="text/plain" id="blob{}">{}</script>\n'
+    scripts = "".join(blob.format(index, base64.b64encode(one).decode()) for index, one in enumerate(blobs))
     page = files("gsim3d.viewer").joinpath("player.html").read_text()
     script = files("gsim3d.viewer").joinpath("player.js").read_text()
     filled = page.replace("{{title}}", html.escape(title, quote=False)).replace("{{script}}", script)
     filled = filled.replace("{{blobs}}", scripts).replace("{{poster}}", _jpeg(_poster(first, view, background)))
-    content = filled.replace("{{header}}", json.dumps(header).replace("<", "\\u003c"))
-    write_whole(path, content)
+    write_whole(path, filled.replace("{{header}}", json.dumps(header).replace("<", "\\u003c")))
 
 
 def _packed(path: Path, frames: Sequence[Splats]) -> tuple[dict, list[bytes]]:
@@ -132,31 +131,23 @@ def _packed(path: Path, frames: Sequence[Splats]) -> tuple[dict, list[bytes]]:
     header: dict = {"count": count, "frames": len(frames), "middle": middle.tolist(), "n_sh": n_sh, "sh0": SH_0}
     header["channels"], blobs = {}, []
     for name, (table, step) in channels.items():
-        order = _order(name, table)
+        order = 0 if (table == table[:1]).all() else 2 if name == "means" else 1
+        header["channels"][name] = {"step": step, "width": table.shape[2], "order": order, "blob": len(blobs)}
         blobs.append(_deflated(table, order))
-        about = {"step": step, "width": table.shape[2], "order": order, "blob": len(blobs) - 1}
-        header["channels"][name] = about
     return header, blobs
 
 
-def _order(name: str, table: np.ndarray) -> int:
-    """0: only the first frame is stored; 1 or 2: which difference over time."""
-    if len(table) == 1 or (table == table[:1]).all():
-        return 0
-    return 2 if name == "means" else 1
-
-
 def _deflated(table: np.ndarray, order: int) -> bytes:
-    """Differences as zigzag uint32, in byte planes that are not zero everywhere: a byte with their number first."""
-    if order == 0:
-        values = table[:1].astype(np.int64)
-    else:
-        values = table.astype(np.int64)
-        for _ in range(order):
-            values = np.concatenate([values[:1], np.diff(values, axis=0)])
+    """Differences of ``order`` over time, 0: the first frame alone, as zigzag uint32.
+
+    In byte planes that are not zero everywhere: a byte with their number first.
+    """
+    values = table[: len(table) if order else 1].astype(np.int64)
+    for _ in range(order):
+        values = np.concatenate([values[:1], np.diff(values, axis=0)])
     zigzag = np.where(values < 0, -2 * values - 1, 2 * values).astype("<u4").transpose(0, 2, 1)
     planes = np.ascontiguousarray(zigzag).view(np.uint8).reshape(-1, 4).T
-    n_planes = max(1, next((k + 1 for k in range(3, -1, -1) if planes[k].any()), 1))
+    n_planes = next((k + 1 for k in (3, 2, 1) if planes[k].any()), 1)
     packer = zlib.compressobj(6, zlib.DEFLATED, -15)
     return packer.compress(bytes([n_planes]) + planes[:n_planes].tobytes()) + packer.flush()
 
@@ -179,20 +170,14 @@ def _view(view: View) -> dict:
     return {"viewmat": viewmat.tolist(), "K": K.tolist(), "width": int(view.width), "height": int(view.height)}
 
 
-def _around(gaussians: Gaussians) -> View:
-    camera = camera_around(gaussians, AZIMUTH, POSTER)
-    return View(camera.viewmats[0].numpy(), camera.Ks[0].numpy(), POSTER, POSTER)
-
-
 @torch.no_grad()
 def _poster(gaussians: Gaussians, view: View, background: tuple[float, float, float]) -> np.ndarray:
     """Image uint8 [H, W, 3] of the first look, its longer side of POSTER pixels."""
     zoom = POSTER / max(view.width, view.height)
     width, height = (max(1, round(zoom * side)) for side in (view.width, view.height))
     K = torch.tensor(np.asarray(view.K, np.float64) * [[zoom], [zoom], [1]])[None].float()
-    one = torch.ones(1)
     viewmat = torch.tensor(np.asarray(view.viewmat, np.float64))[None].float()
-    camera = Cameras(viewmat, K, 0.1 * one, 1e6 * one, torch.tensor([0]), width, height)
+    camera = Cameras(viewmat, K, torch.tensor([0.1]), torch.tensor([1e6]), torch.tensor([0]), width, height)
     return picture(gaussians, camera, torch.tensor(background))
 
 

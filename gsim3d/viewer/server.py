@@ -11,6 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -195,7 +196,7 @@ class Viewer:
         self.draw()
 
     def on(self, handle: Any, act: Callable[..., Any], event: str = "on_update") -> None:
-        """Calls ``act`` when a user changes ``handle``, or with the click in a scene; its InputError is shown there."""
+        """Calls ``act`` when a user changes ``handle``, or with the click in a scene; its error is shown there."""
 
         def call(change: Any) -> None:
             if change.client is None:  # changed by this class
@@ -205,7 +206,7 @@ class Viewer:
                     return
                 try:
                     act(change) if handle is self.server.scene else act()
-                except (InputError, NumericalError) as error:
+                except (InputError, NumericalError, OSError) as error:
                     change.client.add_notification("Not possible", str(error), color="red")
 
         register = getattr(handle, event)
@@ -226,7 +227,7 @@ class Viewer:
 
     def _export(self, path: str, is_whole: bool) -> None:
         frames = range(self._target.n_frames) if is_whole else [self.timeline.frame]
-        self._status.content = f"Written: {self._target.export(path, frames, self.layers)}"
+        self._status.content = f"Written: {self._target.export(Path(path).expanduser(), frames, self.layers)}"
 
     # Drawing
 

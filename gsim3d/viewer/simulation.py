@@ -13,7 +13,7 @@ from gsim3d.data import Scene
 from gsim3d.dynamics import concatenate, last_steps
 from gsim3d.effects.edits import Duplicate, Edit, Move, Operation, Recolor, Remove, Throw, structure_of
 from gsim3d.effects.plan import Plan
-from gsim3d.effects.selection import Selection
+from gsim3d.effects.selection import Selection, newest_mask
 from gsim3d.effects.spec import BACKGROUNDS, CHANGING, POLICIES, EffectsSpec, OutputEffects, Sleep, UnsupportedEffect
 from gsim3d.errors import InputError
 from gsim3d.numerics.speed import encode, encode_histories
@@ -53,6 +53,23 @@ class Switch:
     now: str  #: the setting that is chosen
     settings: dict[str, EffectsSpec]  #: setting -> effects with it; one alone where there is no choice
     why: str = ""  #: why other settings are not possible with this model; empty: all are
+
+
+@dataclass(frozen=True)
+class OfBody(Selection):
+    """Particles of one body, in the steps where bodies are known: not in those of images before the newest."""
+
+    body: tuple[float, ...] = ()  #: as in :class:`gsim3d.state.Particles`; empty: any
+
+    def mask(self, particles: Particles) -> Tensor:
+        chosen = super().mask(particles)
+        if particles.body is None or not self.body:
+            return chosen
+        clouds, is_mine = particles.row_cloud(), (particles.body == particles.body.new_tensor(self.body)).all(1)
+        chosen = chosen & (is_mine | ~torch.isin(clouds, clouds[is_mine]))
+        if not bool(chosen[newest_mask(particles)].any()):
+            raise InputError("the selection is empty: the box holds nothing of the chosen body")
+        return chosen
 
 
 class Simulation:
@@ -179,7 +196,9 @@ class Simulation:
         self.target.replace([*self.target.particles[: frame + 1], *steps])
         return self.seconds_a_step
 
-    def operation(self, name: str, which: str, vector: Sequence[float], box: Box | None = None) -> Operation:
+    def operation(
+        self, name: str, which: str, vector: Sequence[float], box: Box | None = None, body: Sequence[float] = ()
+    ) -> Operation:
         """The operation that a user chose.
 
         Args:
@@ -187,16 +206,16 @@ class Simulation:
             which: particles, as of :class:`gsim3d.effects.selection.Selection`.
             vector: metres of a move or a copy, metres a step of a throw, or a colour.
             box: lowest and highest corner, in the axes of the viewer; None: everywhere.
+            body: value of the particles of the only body that is meant; empty: any.
         Raises:
             InputError: there is no such operation or selection.
         """
         if name not in OPERATIONS:
             raise InputError(f"operation must be one of {', '.join(OPERATIONS)}; got {name!r}")
-        corners = None
-        if box is not None:
-            corners = tuple(tuple(float(x) + o for x, o in zip(corner, self._offset, strict=True)) for corner in box)
+        moved = (zip(corner, self._offset, strict=True) for corner in box or ())
+        corners = tuple(tuple(float(x) + o for x, o in corner) for corner in moved) or None
         fields = {VECTORS[name]: tuple(float(x) for x in vector)} if name in VECTORS else {}
-        return OPERATIONS[name](Selection(which, corners), **fields)
+        return OPERATIONS[name](OfBody(which, corners, tuple(body)), **fields)
 
     # Bodies
 

@@ -47,16 +47,13 @@ def open_target(
         return Target(recorded.name, fps or recorded.fps, scene=recorded, first=_checked(recorded, start))
     sequence = open_sequence(path, up)
     recorded = None if scene is None else Scene.open(scene)
-    if recorded is None and start:
+    name, fps = path.resolve().name, fps or sequence.fps
+    if recorded is not None:
+        frames, first = _InAxesOf(recorded, sequence), _checked(recorded, start)
+        return Target(name, fps or recorded.fps, frames=frames, scene=recorded, first=first)
+    if start:
         raise InputError(f"--start {start}: {path} has no such step without --scene")
-
-    return Target(
-        path.resolve().name,
-        fps or sequence.fps or (FPS if recorded is None else recorded.fps),
-        frames=sequence if recorded is None else _InAxesOf(recorded, sequence),
-        scene=recorded,
-        first=0 if recorded is None else _checked(recorded, start),
-    )
+    return Target(name, fps or FPS, frames=sequence)
 
 
 def state_of(target: str | Path) -> Path | None:

@@ -4,6 +4,7 @@ import dataclasses
 import subprocess
 import sys
 import time
+import types
 import urllib.request
 
 import numpy as np
@@ -258,6 +259,20 @@ def test_viewer_simulates_on_from_the_frame_that_is_shown(viser, simulation):
         viewer.timeline.seek(2)
         viewer.simulate_on(6, [Move("all", (0.0, 0.0, 0.1))])
         assert viewer.timeline.n_frames == 9 and viewer.timeline.frame == 2
+
+
+def test_errors_of_files_are_shown_and_a_home_is_meant(viser, simulation, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "file").touch()
+    with server.Viewer(simulation.target, simulation) as viewer:
+        calls, said = [], []
+        handle = types.SimpleNamespace(on_click=calls.append)
+        client = types.SimpleNamespace(add_notification=lambda *args, **_: said.append(args[1]))
+        viewer.on(handle, lambda: viewer._export("~/seen.ply", False), "on_click")
+        viewer.on(handle, lambda: (tmp_path / "file" / "a.ply").touch(), "on_click")
+        for call in calls:
+            call(types.SimpleNamespace(client=client))
+    assert (tmp_path / "seen.ply").is_file() and len(said) == 1 and "a.ply" in said[0]
 
 
 def test_view_command_prints_the_address_and_ends_with_ctrl_c(viser, run, scene, checkpoint, monkeypatch, capsys):

@@ -10,6 +10,7 @@ import torch
 from gsim3d.cameras import InputSpec
 from gsim3d.cli.main import main
 from gsim3d.effects.edits import Duplicate, Move, Recolor, Remove, Throw
+from gsim3d.effects.selection import newest_mask
 from gsim3d.errors import FitWarning, InputError
 from gsim3d.io import read_particles, write_particles
 from gsim3d.io.particles import STATE
@@ -231,6 +232,26 @@ def test_a_click_chooses_a_body_or_the_background_until_another_frame_is_shown(v
         for act in (panel._choose, panel._simulate):
             with pytest.raises(InputError, match="pause"):
                 act()
+
+
+def test_panel_edits_one_of_two_bodies_that_overlap(viser, simulation):
+    target, state = simulation.target, simulation._state
+    body = torch.zeros_like(state.means)
+    simulation._state = dataclasses.replace(state, body=body.where(~newest_mask(state)[:, None], body + 1))
+    simulation.simulate_on(1, 2, [Duplicate("moving", (0.0, 0.0, 0.01))])
+    with server.Viewer(target, simulation) as viewer:
+        panel, sizes = viewer._panel, [len(rows) for rows in simulation.bodies(2)]
+        assert len(sizes) == 2 and sizes[0] == sizes[1]
+        viewer.timeline.seek(2)
+        viewer.draw()
+        panel._which.value, panel._edit.value, panel._steps.value = panel._which.options[4], "remove", 2
+        panel._choose()
+        panel._simulate()
+        assert target.particles[3].n_rows == target.particles[2].n_rows - sizes[1]
+        assert [len(rows) for rows in simulation.bodies(4)] == sizes[:1]
+        panel._middle.value = (90.0, 90.0, 90.0)
+        with pytest.raises(InputError, match="the selection is empty"):
+            panel._simulate()
 
 
 def test_panel_shows_what_effects_cost(viser, simulation):
