@@ -292,8 +292,7 @@ class Target:
             fov = 2 * np.arctan(cameras.height / 2 / float(cameras.Ks[i, 1, 1]))
             aspect = cameras.width / cameras.height * float(cameras.Ks[i, 1, 1] / cameras.Ks[i, 0, 0])
             image = None if images is None else images[i]
-            name = str(scene.camera_names[cam])
-            found.append(View(name, quat, to_world[:3, 3].numpy(), float(fov), aspect, image))
+            found.append(View(str(scene.camera_names[cam]), quat, to_world[:3, 3].numpy(), float(fov), aspect, image))
         return found
 
     def _truth(self, frame: int, cams: Sequence[int]) -> np.ndarray | None:
@@ -313,8 +312,7 @@ class Target:
         if self.scene is None:
             return None
         truth, gaussians = self._truth(frame, [cam]), self.seen(frame, layers)
-        shape = (self.scene.height, self.scene.width, 3)
-        images = [np.zeros(shape, np.uint8) if truth is None else truth[0]]
+        images = [np.zeros((self.scene.height, self.scene.width, 3), np.uint8) if truth is None else truth[0]]
         if gaussians is not None:
             camera = self.scene.cameras_at([cam], [self.first + frame])
             images.append(picture(gaussians, camera))

@@ -185,8 +185,7 @@ def _jpeg(image: np.ndarray) -> str:
     """Base64 of an image as JPEG."""
     import cv2
 
-    content = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])[1]
-    return base64.b64encode(content.tobytes()).decode()
+    return base64.b64encode(cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])[1]).decode()
 
 
 def _encoded(path: Path, images: Sequence[np.ndarray]) -> list[str]:

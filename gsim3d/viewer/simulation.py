@@ -31,6 +31,7 @@ PATIENCE = 1.0  # seconds; a setting whose rounds have taken so long is not time
 MARGIN = 0.03  # of the longest side of a body, around it
 HIT, NEAR = 2.0, 0.01  # a ray hits what is nearer to it than so many standard deviations, or such a share of the depth
 SEEN = 0.2  # least opacity of what a ray hits
+BODIES = SegmentationConfig(neighbors=12, min_share=0.02, neck=0.3)  # tells a small one from a cloth
 Box = tuple[Sequence[float], Sequence[float]]
 
 
@@ -228,8 +229,10 @@ class Simulation:
             return []
         body = particles.body  # known where the model segments bodies, from the newest encoded step on
         if body is None or torch.equal(body[rows], particles.means[rows]):
-            movable = Movable(particles, self._simulator.config.dynamics.grid_size)
-            body = segment_bodies(movable, particles, SegmentationConfig())
+            while frame >= self.target.n_encoded and self.target.particles[frame - 1].n_rows == len(particles.means):
+                frame -= 1  # to the same particles before bodies touched
+            particles = self.target.particles[frame]
+            body = segment_bodies(Movable(particles, self._simulator.config.dynamics.grid_size), particles, BODIES)
         _, label, count = torch.unique(body[rows], dim=0, return_inverse=True, return_counts=True)
         return [rows[label == one] for one in count.argsort(descending=True).tolist()]
 

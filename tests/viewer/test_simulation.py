@@ -106,6 +106,24 @@ def test_bodies_are_found_and_boxes_hold_them_in_the_history(simulation):
     assert simulation.bodies(0) == []
 
 
+def test_bodies_that_touch_later_stay_two_and_a_small_one_is_no_part_of_a_cloth(simulation):
+    target = simulation.target
+    given = target.particles[1]
+    many = (given.activity != FROZEN).nonzero()[:, 0][:1].repeat(640)
+    fields = {name: values[many] for name, values in given.row_fields().items() if name != "body"}
+    is_small = torch.arange(640) < 40
+    square = torch.rand(640, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([2.0, 2.0, 0.0])
+    means = square * (1 - 0.75 * is_small.float()[:, None])
+    fallen = []
+    for height in (1.0, 0.5, 0.0):
+        fields["means"] = means + is_small[:, None] * torch.tensor([0.0, 0.0, height])
+        cloud = dataclasses.replace(given, body=None)
+        fallen.append(cloud.with_clouds(cloud.clouds.with_counts([640]), **fields))
+    target.replace([target.particles[0], *fallen])
+    for frame in (1, 2, 3):
+        assert [len(rows) for rows in simulation.bodies(frame)] == [600, 40]
+
+
 def test_a_ray_hits_the_nearest_gaussian_that_is_shown():
     gaussians = splats([[2.0, 0.0, 0.0], [4.0, 0.05, 0.0], [-3.0, 0.0, 0.0], [1.0, 2.0, 0.0]])
     every = torch.ones(4, dtype=torch.bool)
