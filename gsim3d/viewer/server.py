@@ -69,11 +69,11 @@ class Viewer:
         viser = load_viser()
         self._target, self._simulation, self._lock = target, simulation, threading.RLock()
         self.timeline, self.layers = Timeline(target.n_frames, target.fps), Layers()
+        self.timeline.seek(max(0, target.n_encoded - 1) if simulation else 0)  # the first that can be simulated on
         scene = target.scene
         n_cams = 0 if scene is None else scene.n_cams
         self._cams = sorted({i * n_cams // MOST_CAMERAS for i in range(MOST_CAMERAS)}) if n_cams else []
-        first = target.gaussians(0)
-        self._unit = 1.0 if first is None else unit_of(first)
+        self._unit = 1.0 if (first := target.gaussians(0)) is None else unit_of(first)
         self._splats, self._frusta, self._closed = None, {}, threading.Event()
         self._note, self._next = "", deque(maxlen=1)
         with contextlib.redirect_stdout(io.StringIO()):  # its banner

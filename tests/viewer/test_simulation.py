@@ -195,6 +195,7 @@ def test_panel_edits_the_body_that_is_chosen(viser, simulation, name, kind):
     target = simulation.target
     with server.Viewer(target, simulation) as viewer:
         panel = viewer._panel
+        assert viewer.timeline.frame == viewer._frame.value == target.n_encoded - 1 > 0  # can be simulated on
         viewer.timeline.seek(2)
         viewer.draw()
         panel._which.value = panel._which.options[3]
