@@ -49,8 +49,8 @@ FORMATS = {
 }
 
 
-def format_of(path: str | Path) -> tuple[str, Format]:
-    """Suffix and format of a file name.
+def format_of(path: str | Path, others: Sequence[str] = ()) -> tuple[str, Format]:
+    """Suffix and format of a file name; an error also names ``others``, suffixes of films.
 
     Raises:
         InputError: no format has this suffix.
@@ -59,7 +59,7 @@ def format_of(path: str | Path) -> tuple[str, Format]:
     for suffix, found in FORMATS.items():  # .compressed.ply stands before .ply
         if name.endswith(suffix):
             return suffix, found
-    raise InputError(f"{path}: no format of Gaussians has this suffix; choose from {', '.join(FORMATS)}")
+    raise InputError(f"{path}: no format of Gaussians has this suffix; choose from {', '.join((*FORMATS, *others))}")
 
 
 def write_splats(

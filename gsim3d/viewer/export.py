@@ -76,7 +76,7 @@ def write_frames(
         write_player(out, gaussians, fps=fps, title=out.stem)
         what = f"{max(one.means.shape[0] for one in gaussians):,} Gaussians for any browser"
     else:
-        suffix, kind = format_of(out)
+        suffix, kind = format_of(out, (".mp4", ".html"))
         if count > 1 and not kind.has_time:
             instead = "choose one (--frame), or write .html, .usdc or .mp4"
             raise InputError(f"{to}: {suffix} holds one frame, and there are {count}: {instead}")

@@ -6,6 +6,7 @@ import pytest
 
 from gsim3d.cli.main import main
 from gsim3d.data import Scene
+from gsim3d.errors import InputError
 from gsim3d.io.formats import write_splats
 from gsim3d.viewer.export import export
 from gsim3d.viewer.films import ACCENT, film_frames
@@ -59,6 +60,8 @@ def n_frames(path):
 
 def test_export_goes_once_around_a_single_frame(tmp_path):
     write_splats(tmp_path / "a.ply", make())
+    with pytest.raises(InputError, match=r"a\.avi: no format .* has this suffix; choose from .*\.ply, .*\.mp4, \.html"):
+        export(tmp_path / "a.ply", tmp_path / "a.avi")
     said = export(tmp_path / "a.ply", tmp_path / "a.mp4", size=64, fps=5)
     assert "64x64" in said and n_frames(tmp_path / "a.mp4") == 30
 
