@@ -54,6 +54,16 @@ def test_example_runs(example, folder):
         assert float(re.findall(r"PSNR ([\d.]+) dB", output)[-1]) > 20
 
 
+def test_a_scene_is_fitted_by_both_packages(tmp_path):
+    (tmp_path / "gsplat.py").write_text("from gsim3d.compat.gsplat import rasterization\n")
+    start = (
+        f"import runpy, sys; sys.path.insert(0, '.'); runpy.run_path({str(ROOT / 'examples' / '07_fit_scene.py')!r})"
+    )
+    output = run(["-c", start, "--steps", "6", "--beside", "gsplat"], tmp_path)
+    ours, theirs = (re.findall(rf"{name}: step 6, .*PSNR (.*) dB", output) for name in ("gsim3d", "gsplat"))
+    assert len(ours) == len(theirs) == 1
+
+
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
 def test_example_is_short(example):
     assert 20 <= len(example.read_text().splitlines()) <= LONG.get(example.stem, 60)
