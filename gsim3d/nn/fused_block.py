@@ -190,6 +190,6 @@ class _Block(torch.autograd.Function):
             else:
                 kept = Saved(*saved[: len(Saved._fields)])
             keeps = keep_attention, keep_mlp
-            with Streams(conv_input, late=True) as streams:  # the gradients are added up behind the backward pass
+            with Streams(conv_input) as streams:
                 grads = _backward(ctx.plan, ctx.weights, kept, conv_input, *keeps, grad_sum, grad_out, streams)
         return None, None, *grads[:2], None, None, *grads[2:]

@@ -5,9 +5,8 @@ Kernels over few rows leave most of a GPU idle. In a graph, those of a stream ru
 
 from __future__ import annotations
 
-import contextlib
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -22,14 +21,13 @@ class Streams:
 
     While a graph is captured on the device of ``like``, :meth:`run` makes nodes that wait for the work before them, not
     the other way round. Else, and on the CPU, everything runs in order. The numbers are the same. ``n_streams``: at
-    most ``MANY_STREAMS``, for long chains of small kernels. ``late``: nothing reads the results before the end of
-    :func:`joined_late`, if that is on.
+    most ``MANY_STREAMS``, for long chains of small kernels.
     """
 
-    def __init__(self, like: Tensor, n_streams: int = N_STREAMS, *, late: bool = False):
+    def __init__(self, like: Tensor, n_streams: int = N_STREAMS):
         captured = like.is_cuda and not torch.compiler.is_compiling() and torch.cuda.is_current_stream_capturing()
         self._streams = _streams(like.device)[:n_streams] if captured else ()
-        self._count, self._read, self._late = 0, [], late
+        self._count, self._read = 0, []
 
     def __enter__(self) -> Streams:
         return self
@@ -46,38 +44,9 @@ class Streams:
             return function(*arguments)
 
     def __exit__(self, *_) -> None:
-        used = self._streams[: self._count]
-        if self._late and used and _unjoined is not None:
-            events = [stream.record_event() for stream in used]
-            _join(_unjoined)
-            _unjoined.append((events, self._read))
-            return
-        for stream in used:
+        for stream in self._streams[: self._count]:
             torch.cuda.current_stream().wait_stream(stream)
         self._read.clear()
-
-
-_unjoined: list[tuple[list[torch.cuda.Event], list]] | None = None  # of all threads: autograd has its own
-
-
-@contextlib.contextmanager
-def joined_late() -> Iterator[None]:
-    """A context in which a late context of :class:`Streams` is awaited when the next one is left, and the last one in
-    the end: meanwhile the memory that it reads is kept."""
-    global _unjoined
-    before, _unjoined = _unjoined, []
-    try:
-        yield
-        _join(_unjoined)
-    finally:
-        _unjoined = before
-
-
-def _join(contexts: list[tuple[list[torch.cuda.Event], list]]) -> None:
-    for events, _ in contexts:
-        for event in events:
-            torch.cuda.current_stream().wait_event(event)
-    contexts.clear()
 
 
 @functools.cache

@@ -35,7 +35,6 @@ from gsim3d.nn.multiview_encoder import Encoder, StaticShapes
 from gsim3d.numerics.report import StabilityReport
 from gsim3d.ops import PyramidCapacity
 from gsim3d.ops.curve import Pyramid
-from gsim3d.ops.streams import joined_late
 from gsim3d.simulator import Simulator
 from gsim3d.state import ASLEEP, DYNAMIC, Particles
 from gsim3d.train.gradients import in_segments, recomputing
@@ -306,8 +305,7 @@ class _Step:
         report.close()  # recomputation in the backward pass must not count again
         loss, errors = owner.loss(images, self._targets, self._weights)
         once = [*owner.simulator.encoder.parameters(), *owner.simulator.renderer.parameters()]
-        with joined_late():  # each alias has one gradient
-            gradients = torch.autograd.grad(loss, [*once, *chain.from_iterable(of_calls)], allow_unused=True)
+        gradients = torch.autograd.grad(loss, [*once, *chain.from_iterable(of_calls)], allow_unused=True)
         known = dict(zip(once, gradients))
         if of_calls:
             n = len(of_calls[0])
