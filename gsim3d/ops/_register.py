@@ -17,7 +17,7 @@ from gsim3d.errors import GradientError
 from gsim3d.ops import _load  # noqa: F401
 
 _library = torch.library.Library("gsim3d", "FRAGMENT")
-_functions: dict[str, type[torch.autograd.Function]] = {}
+_functions: dict[str, tuple[type[torch.autograd.Function], dict[str, int]]] = {}  # and places without a gradient
 
 
 def fakes(**functions: Callable) -> None:
@@ -61,7 +61,9 @@ def register_gradients(
     """
     _register(op, op, Info(backward, setup), without)
     if batched is not None:
-        _functions[op] = _function_of(op, backward, setup, jvp, batched)
+        names = [argument.name for argument in getattr(torch.ops.gsim3d, op).default._schema.arguments]
+        function = _function_of(op, backward, setup, jvp, batched)
+        _functions[op] = function, {name: names.index(name) for name in without}
     for name in gradient_ops:
         _register(name, op, Info(_second_derivative_of(op), None), ())
 
@@ -70,7 +72,9 @@ def call(op: str, *arguments: Any) -> Any:
     """What gsim3d::``op`` returns, also under the transforms of ``torch.func`` and in forward mode."""
     transformed = torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0
     if transformed and op in _functions and not torch.compiler.is_compiling():
-        return _functions[op].apply(*arguments)
+        function, without = _functions[op]
+        refuse(op, {name: arguments[k] for name, k in without.items()})
+        return function.apply(*arguments)
     return getattr(torch.ops.gsim3d, op)(*arguments)
 
 
@@ -171,9 +175,10 @@ def refuse(op: str, tensors: dict[str, Tensor], *, forward_only: bool = False) -
     for name, value in tensors.items():
         if not isinstance(value, Tensor):
             continue
-        if is_forward and forward_ad.unpack_dual(value).tangent is not None:
+        along = is_forward and forward_ad.unpack_dual(value).tangent is not None
+        if along and forward_only:
             said = "has no derivative in forward mode (jvp); use reverse mode, as torch.func.vjp"
-        elif not forward_only and value.requires_grad:
+        elif not forward_only and (along or value.requires_grad):
             said = f"has no gradient (order 1); give {name}.detach(), or ask for other gradients"
         else:
             continue

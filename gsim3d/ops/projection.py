@@ -92,8 +92,8 @@ def project_gaussians(
     Determinism:
         equal bits for any number of threads; on a GPU from run to run, and nothing waits for the device.
     Raises:
-        NumericalError: a number is not finite or beyond 1e15, or a scale negative; CPU only. On a GPU such a row is not
-            seen.
+        NumericalError: a number is not finite or beyond 1e15, a scale negative or an opacity outside [0, 1]; CPU only.
+            On a GPU such a row is not drawn.
         ValueError, TypeError: an argument is malformed; the message names it.
     Source:
         Zwicker et al. 2002 (EWA splatting), Yu et al. 2024 (Mip-Splatting), OpenCV's camera models; conventions of
@@ -139,7 +139,7 @@ def project_gaussians(
 
 
 def lens_limits(lens: str, distortion: Tensor) -> Tensor:
-    """The largest radius up to which a lens does not fold back, found on 512 steps and then by bisection.
+    """The largest radius up to which a lens does not fold back, found on 512 steps and on finer ones in between.
 
     Args:
         lens: "opencv" or "fisheye".
@@ -147,30 +147,25 @@ def lens_limits(lens: str, distortion: Tensor) -> Tensor:
     Returns:
         float64 [I]: tangent ("opencv") or angle in radians ("fisheye"); infinite where it never does.
     """
-    k = F.pad(distortion.detach().double(), (0, 8 - distortion.shape[1])).unbind(1)
-    steps = torch.arange(513, device=distortion.device, dtype=torch.float64) / 512
-    grid = steps * math.pi if lens == "fisheye" else (steps * (math.pi / 2 - 1e-2)).tan()
+    k = F.pad(distortion.detach().double(), (0, 8 - distortion.shape[1]))
+    fisheye = lens == "fisheye"
+    up, down = (k[:, :4], k[:, 4:]) if fisheye else (torch.cat([k[:, :2], k[:, 4:5]], 1), k[:, 5:])
+    n, radius = torch.arange(1, up.shape[1] + 1, device=k.device), torch.positive if fisheye else torch.tan
 
     def folds(r: Tensor) -> Tensor:
         """bool [I, S] at radii [I, S]."""
-        r2 = r * r
-        if lens == "fisheye":
-            rise = 1 + sum((2 * n + 3) * k[n][:, None] * r2 ** (n + 1) for n in range(4))
-            return torch.le(rise, 0)
-        up, down = ((k[0], k[1], k[4]), (k[5], k[6], k[7]))
-        above, below = (1 + sum(c[n][:, None] * r2 ** (n + 1) for n in range(3)) for c in (up, down))
-        slope = 1 + sum((2 * n + 3) * up[n][:, None] * r2 ** (n + 1) for n in range(3))  # of r * above
-        descent = sum((2 * n + 2) * down[n][:, None] * r2 ** (n + 1) for n in range(3))  # r times that of below
+        powers = (r * r)[..., None] ** n
+        above, below = (1 + (c[:, None] * powers).sum(-1) for c in (up, down))
+        slope = 1 + ((2 * n + 1) * up[:, None] * powers).sum(-1)  # of r * above
+        descent = (2 * n * down[:, None] * powers).sum(-1)  # r times that of below
         return torch.le(below, 0) | torch.le(slope * below - above * descent, 0)
 
-    bad = folds(grid.expand(len(distortion), -1))
-    first = bad.int().argmax(1)
-    low, high = grid[(first - 1).clamp_min(0)], grid[first]
-    for _ in range(40):
-        middle = (low + high) / 2
-        at = folds(middle[:, None])[:, 0]
-        low, high = torch.where(at, low, middle), torch.where(at, middle, high)
-    return torch.where(bad.any(1), low, math.inf)
+    low, high = torch.zeros_like(k[:, :1]), torch.full_like(k[:, :1], math.pi if fisheye else math.pi / 2 - 1e-2)
+    for n_steps in (512, *[64] * 5):  # a GPU launches each operation
+        grid = low + (high - low) * torch.arange(n_steps + 1, device=k.device) / n_steps
+        first = folds(radius(grid)).int().argmax(1, keepdim=True)  # 0: never
+        low, high = grid.gather(1, (first - 1).clamp_min(0)), grid.gather(1, first)
+    return torch.where(high > 0, radius(low), math.inf)[:, 0]
 
 
 def sh_to_color(directions: Tensor, sh: Tensor) -> Tensor:
@@ -229,6 +224,7 @@ def _check(tensors: dict, cameras: Cameras, cu_rows: Tensor | None, sizes: dict,
             raise ValueError(f"{OP}: distortion must be [I={n_images}, {wanted}]; got {list(distortion.shape)}")
     check_numbers(OP, largest_of=LARGEST, **tensors)
     check_numbers(OP, negative=False, scales=tensors.get("scales"))
+    check_numbers(OP, largest_of=1.0, negative=False, opacities=tensors.get("opacities"))
 
 
 def _pairs(means, *rest):

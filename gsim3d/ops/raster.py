@@ -387,8 +387,6 @@ def _tangent(scene, tangents, images, options, active):
 
 
 def _jvp(inputs, tangents, outputs):
-    if tangents[8] is not None:
-        raise GradientError(f"{OP}: cameras.Ks has no gradient (order 1)", op=OP, argument="Ks", order=1)
     zeros = [torch.zeros_like(x) for x in outputs[:4]]
     return (*_tangent(inputs[:11], tangents[:8], zeros, inputs[11:16], inputs[20:])[:4], *[None] * 4)
 

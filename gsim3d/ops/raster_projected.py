@@ -49,7 +49,7 @@ def rasterize_projected(
     Determinism:
         equal bits for any number of threads; on a GPU from run to run, and nothing waits for the device.
     Raises:
-        NumericalError: a number is not finite or beyond 1e15; CPU only. On a GPU such a row is left out.
+        NumericalError: numbers not finite or beyond 1e15, opacities outside [0, 1]; on a GPU such rows are left out.
         ValueError, TypeError: an argument is malformed; the message names it.
     Source:
         Kerbl et al. 2023 (3D Gaussian splatting), Ye et al. 2024 (AbsGS).
@@ -104,6 +104,7 @@ def _check(rows: dict[str, Tensor], optional: dict[str, Tensor], width: int, hei
     if background is not None and background.shape not in ((d,), (n_images, d)):
         raise ValueError(f"{OP}: background must be [D={d}] or [I={n_images}, D]; got {list(background.shape)}")
     check_numbers(OP, largest_of=LARGEST, **rows, background=background)
+    check_numbers(OP, largest_of=1.0, negative=False, opacities=rows["opacities"])
 
 
 def _images(means2d, conics, depths, opacities, color, features, background, absolute, image_cloud, cu_rows, *rest):

@@ -11,6 +11,7 @@ from gsim3d.errors import GradientError, NumericalError
 from gsim3d.ops import project_gaussians, rasterize_gaussians, rasterize_projected, sh_to_color
 from gsim3d.ops.projection import lens_limits
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, assert_same_bits_for_any_threads
+from tests.effects.counting import counted
 from tests.ops.raster_scene import random_scene
 from tests.oracle import projection as oracle
 from tests.oracle.raster import legendre_basis
@@ -188,6 +189,7 @@ def test_what_is_not_seen_has_no_gradient(device):
 # ---- 3 gradcheck in float64, all inputs together -------------------------------------------------------------------
 
 
+@pytest.mark.unsanitized("runs the kernels of test_backward hundreds of times")
 @pytest.mark.parametrize(("lens", "jacobian"), [(lens, "exact") for lens in LENSES] + [("pinhole", "clamped")])
 def test_gradcheck(device, lens, jacobian):
     case = Case(lens, n=5, device=device)
@@ -328,6 +330,14 @@ def test_lenses_without_a_fold_have_no_limit():
     assert lens_limits("fisheye", torch.tensor([[0.1, 0.01, 0.0, 0.0]])).item() == math.inf
 
 
+@pytest.mark.parametrize("lens", DISTORTION)
+def test_limits_take_few_operations(lens):
+    # Each is a launch on a GPU, in every call with a distortion.
+    with counted() as operations:
+        lens_limits(lens, torch.tensor([DISTORTION[lens]]))
+    assert operations.calls.total() < 300
+
+
 def test_on_the_axis_of_a_fisheye(device):
     # theta / r is 0 / 0 there; its derivatives are those of the pinhole.
     case = Case(device=device)
@@ -440,6 +450,9 @@ def test_errors_name_the_argument():
         call(means=torch.full_like(means, math.nan))
     with pytest.raises(NumericalError, match="scales must be finite, not negative and at most"):
         project_gaussians(means, quats, -scales - 1, cameras, cu_rows=case.cu_rows)
+    for opacity in (-0.1, 1.1):
+        with pytest.raises(NumericalError, match="opacities must be finite, not negative and at most 1; got"):
+            call(opacities=torch.full_like(case.opacities, opacity))
     with pytest.raises(ValueError, match="cu_rows must ascend from 0"):
         call(cu_rows=case.cu_rows.flip(0))
     with pytest.raises(ValueError, match="sh must be float32, as directions, or of 16 bits; got torch.float64"):

@@ -264,6 +264,9 @@ def test_errors_name_the_argument():
         rasterize_projected(*first, colors, width=4, height=4, cu_pairs=torch.tensor([0, 10]))
     with pytest.raises(NumericalError, match="means2d must be finite"):
         rasterize_projected(first[0] / 0, *first[1:], colors, **size)
+    for wrong in (first[3] - 1, first[3] + 1):
+        with pytest.raises(NumericalError, match="opacities must be finite, not negative and at most 1; got"):
+            rasterize_projected(*first[:3], wrong, colors, **size)
     with pytest.raises(NumericalError, match="rasterize_projected: background must be finite"):
         rasterize_projected(*first, colors, background=background / 0, **size)
 

@@ -139,3 +139,22 @@ def test_what_is_not_there_is_refused_by_name(device):
         value = loss(leaf)
         for _ in range(2 if device.type == "cuda" else 3):
             value = torch.autograd.grad(value.sum(), leaf, create_graph=True)[0]
+
+
+def test_gradients_of_Ks_are_refused_by_name():
+    scene, _ = small()
+
+    def alpha(Ks, means):
+        return scene.replace(Ks=Ks).render(means, *scene.inputs[1:])[1].sum()
+
+    Ks, means = scene.Ks, torch.stack([scene.means, scene.means])
+    transformed = {
+        "grad": lambda: torch.func.grad(alpha)(Ks, scene.means),
+        "vmap of grad": lambda: torch.func.vmap(torch.func.grad(alpha), (None, 0))(Ks, means),
+        "grad of vmap": lambda: torch.func.grad(lambda K: torch.func.vmap(alpha, (None, 0))(K, means).sum())(Ks),
+        "jvp": lambda: torch.func.jvp(lambda K: alpha(K, scene.means), (Ks,), (Ks,)),
+    }
+    for call in transformed.values():
+        with pytest.raises(GradientError, match="Ks has no gradient"):
+            call()
+    assert torch.func.grad(alpha, 1)(Ks, scene.means).abs().max() > 0
