@@ -118,8 +118,9 @@ class StepWatch:
         return [math.sqrt(sum(square.item() for square in squares)) for squares in self._squares]
 
 
-def _note(squares: list[Tensor], gradient: Tensor) -> None:
-    squares.append(gradient.detach().double().square().sum())
+def _note(squares: list[Tensor], gradient: Tensor | None) -> None:
+    if gradient is not None:  # None: zero, from an operator that nothing flows through
+        squares.append(gradient.detach().double().square().sum())
 
 
 def mean_of_norms(samples: Sequence[Sequence[float]]) -> list[float]:

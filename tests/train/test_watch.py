@@ -146,6 +146,27 @@ def test_norms_through_a_rollout_are_those_of_its_states():
     assert mean_of_norms([[3.0, 0.0], [4.0, 2.0]]) == [2.5, 1.0]
 
 
+class Blocked(torch.autograd.Function):
+    """An operator that returns no gradient, as those on CUDA do for what nothing reads."""
+
+    @staticmethod
+    def forward(ctx, x):
+        return x.clone()
+
+    @staticmethod
+    def backward(ctx, grad):
+        return None
+
+
+def test_norms_where_an_operator_returns_no_gradient():
+    step = make_simulator().encode(make_frames((1,)))
+    step = dataclasses.replace(step, means=2 * step.means.detach().requires_grad_())
+    watch = StepWatch()
+    watch.follow([step])
+    Blocked.apply(step.means).sum().backward()
+    assert watch.norms() == [0.0]
+
+
 def test_norms_by_module_without_gradient():
     grads = {"a.x": torch.tensor([3.0]), "a.y": torch.tensor([4.0]), "b.z": None, "c.w": torch.zeros(2)}
     assert norms_by_module(grads) == {"a": 5.0, "c": 0.0}

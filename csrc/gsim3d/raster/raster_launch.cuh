@@ -55,6 +55,7 @@ void take_group(Job<T>& job, Arena& kept, Arena& scratch) {
   job.slot_cursor = reinterpret_cast<uint32_t*>(job.slot_count + n_images);
   job.list_cursor = job.slot_cursor + n_images;
   job.cursor = job.list_cursor + n_images;
+  job.covered = job.scene.active ? job.cursor + n_tiles : nullptr;
   job.bins = scratch.take<uint32_t>(kBins);
   job.tile_begin = scratch.take<uint32_t>(n_tiles + 1);
   job.depths = scratch.take<T>(job.limits.pairs);
@@ -166,6 +167,8 @@ __device__ bool next_group(const Job<T>& job) {
   const int64_t first = job.group->first, last = job.group->last, thread = int64_t{blockIdx.x} * kBlock + threadIdx.x;
   for (int64_t i = first * job.n_tiles + thread; i < last * job.n_tiles; i += int64_t{gridDim.x} * kBlock)
     job.cursor[i] = 0;
+  for (int64_t i = first * job.n_tiles + thread; job.covered && i < last * job.n_tiles; i += int64_t{gridDim.x} * kBlock)
+    job.covered[i] = 0;
   for (int64_t i = first + thread; i < last; i += int64_t{gridDim.x} * kBlock)
     job.slot_count[i] = 0, job.slot_cursor[i] = 0, job.list_cursor[i] = 0;
   grid.sync();

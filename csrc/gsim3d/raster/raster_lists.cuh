@@ -167,7 +167,8 @@ struct Job {
   List* lists;             // [n_images * n_tiles, kQuarters]
   uint32_t* listed;        // [slots] pairs, list by list in order of depth
   uint32_t* cursor;        // [n_images * n_tiles] counts, then write positions
-  uint32_t* counters;      // `cursor` and all that end in _count or _cursor: zeros when a group starts
+  uint32_t* covered;       // [n_images * n_tiles] counts also of tiles that are not active; null where all are
+  uint32_t* counters;      // `cursor`, `covered` and all that end in _count or _cursor: zeros when a group starts
   unsigned long long* slot_count;  // [n_images] slots of all pairs, then those of the images before
   uint32_t* slot_cursor;   // [n_images] handed out
   uint32_t* tile_begin;    // [n_images * n_tiles + 1] into entries
@@ -185,7 +186,7 @@ struct Job {
 // Words of Job::counters.
 template <typename T>
 GSIM3D_HD int64_t n_counters(const Job<T>& job) {
-  return job.scene.n_images * (2 + 1 + 1 + job.n_tiles);
+  return job.scene.n_images * (2 + 1 + 1 + job.n_tiles * (job.scene.active ? 2 : 1));
 }
 
 // ---- plan: cameras and the images of each cloud; one block --------------------------------------------------------

@@ -122,7 +122,7 @@ class SharedRows {
 template <int kTerms>
 constexpr int kColorColumns = kTerms > 0 ? kTerms * 3 : 3;
 
-// Counts the entries of every active tile of an image that the bounds of a warp touch.
+// Counts the entries of every tile of an image that the bounds of a warp touch.
 template <typename T>
 __device__ void count_tiles(const Job<T>& job, int64_t image, const PixelRect& bounds, Walked<Nothing>* memory) {
   const int64_t first_tile = image * job.n_tiles;
@@ -131,9 +131,12 @@ __device__ void count_tiles(const Job<T>& job, int64_t image, const PixelRect& b
   for (int base = 0; base < tiles.total; base += kWarp) {
     const auto place = tiles.at(base);
     const auto tile = static_cast<uint32_t>(place.y * job.tiles_x + place.x);
-    const unsigned same = tiles.lanes_of(tile, place.used && job.is_active(first_tile + tile));
-    if (__ffs(same) - 1 == static_cast<int>(threadIdx.x % kWarp))
-      atomicAdd(job.cursor + first_tile + tile, static_cast<uint32_t>(__popc(same)));
+    const unsigned same = tiles.lanes_of(tile, place.used);
+    if (__ffs(same) - 1 == static_cast<int>(threadIdx.x % kWarp)) {
+      const auto n = static_cast<uint32_t>(__popc(same));
+      if (job.is_active(first_tile + tile)) atomicAdd(job.cursor + first_tile + tile, n);
+      if (job.covered) atomicAdd(job.covered + first_tile + tile, n);
+    }
   }
 }
 

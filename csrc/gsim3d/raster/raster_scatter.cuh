@@ -41,31 +41,32 @@ __device__ void find_offsets(const Job<T>& job) {
   Group& group = *job.group;
   const int64_t begin = group.tile_begin, end = group.last * job.n_tiles;  // read before thread 0 writes the group
   const int64_t by_slots = group.resumed ? begin : images_by_slots(job, group.first, group.last);
-  const uint64_t max_of_images = job.limits.entries;
-  const uint64_t max_of_part = min(job.limits.entries, job.limits.slots / kQuarters);
+  const uint64_t max_entries = job.limits.entries, max_covered = job.limits.slots / kQuarters;  // of a part
   uint32_t* const of_warp = bins[threadIdx.x / kWarp];
   for (int i = threadIdx.x; i < kWarp * kBins; i += blockDim.x) bins[0][i] = 0;
-  uint64_t before = 0;
+  uint64_t before = 0, others_before = 0;
   uint32_t fit[2] = {};  // tiles, whole images
   for (int64_t base = begin; base < end; base += int64_t{blockDim.x} * kItems) {
     const int64_t mine = base + int64_t{threadIdx.x} * kItems;
-    uint32_t counts[kItems];
-    uint64_t sum = 0, total;
+    uint32_t counts[kItems], more[kItems] = {};  // of active tiles; of the others
+    uint64_t sum = 0, more_sum = 0, total, more_total = 0;
     for (int i = 0; i < kItems; ++i) {
       counts[i] = mine + i < end ? job.cursor[mine + i] : 0;
-      sum += counts[i];
+      if (job.covered && mine + i < end) more[i] = job.covered[mine + i] - counts[i];
+      sum += counts[i], more_sum += more[i];
     }
-    uint64_t position = before + block_sum(sum, total) - sum;
+    uint64_t position = before + block_sum(sum, total) - sum, others = 0;
+    if (job.covered) others = others_before + block_sum(more_sum, more_total) - more_sum;
     int64_t to_image_end = job.n_tiles - mine % job.n_tiles;
     for (int i = 0; i < kItems; ++i) {
       if (mine + i >= end) break;
       job.tile_begin[mine + i] = job.cursor[mine + i] = static_cast<uint32_t>(position);
-      position += counts[i];
+      position += counts[i], others += more[i];
       atomicAdd(of_warp + bin_of(counts[i]), 1u);
-      fit[0] += position <= max_of_part ? 1 : 0;
-      if (--to_image_end == 0) fit[1] += position <= max_of_images ? 1 : 0, to_image_end = job.n_tiles;
+      fit[0] += position <= max_entries && position + others <= max_covered ? 1 : 0;
+      if (--to_image_end == 0) fit[1] += position <= max_entries ? 1 : 0, to_image_end = job.n_tiles;
     }
-    before += total;
+    before += total, others_before += more_total;
     if (mine < end && mine + kItems >= end) job.tile_begin[end] = static_cast<uint32_t>(position);
   }
   uint64_t all_fit;
