@@ -158,7 +158,7 @@ class PointTransformerV3(nn.Module):
             cells: int32 or int64 [N, 3] in [0, 2^16), counted from the smallest one of each cloud: ``grid_coord`` of
                 Pointcept.
             cu_rows: int64 [B + 1], rows of cloud b are cu_rows[b] .. cu_rows[b + 1]: 0, then Pointcept's ``offset``.
-            depth: levels of the curves; None: by the configuration's rule, for which CUDA waits once.
+            depth: levels of the curves, which hold all cells; None: by the configuration's rule: CUDA waits once.
             permutations: per level the order of the curves, of those of the level before: row r is its row
                 permutations[s][r]. Training draws them (Pointcept: at evaluation, too); None: as configured.
         Raises:
@@ -168,10 +168,8 @@ class PointTransformerV3(nn.Module):
         if cells.dtype not in (torch.int32, torch.int64) or cells.dim() != 2 or cells.shape[1] != 3:
             raise InputError(f"{name}: cells must be int32 or int64 [N, 3]; got {cells.dtype} {list(cells.shape)}")
         if depth is None:
-            low, high = (int(v) for v in torch.aminmax(cells)) if len(cells) else (0, 0)
-            depth = max(1, (high + (self.config.depth_rule == "count")).bit_length())
-            if low < 0 or depth > MAX_DEPTH:
-                raise InputError(f"{name}: cells must be in [0, 2^{MAX_DEPTH}); got {low} .. {high}")
+            high = int(cells.max()) if len(cells) else 0
+            depth = min(max(1, (high + (self.config.depth_rule == "count")).bit_length()), MAX_DEPTH)
         if permutations is None:
             permutations = [range(n_curves)] * spec.n_stages
         if [sorted(row) for row in permutations] != [list(range(n_curves))] * spec.n_stages:
@@ -184,6 +182,8 @@ class PointTransformerV3(nn.Module):
         origin = torch.zeros(len(clouds), 3, dtype=torch.float64, device=cells.device)
         places, slots = cells.double() + 0.5, torch.zeros_like(clouds)
         made = ops.build_pyramid(places, cu_rows, clouds, slots, origin, spec, curves=tuple(curves), depth=depth)
+        if made.rows.shape[0] < len(cells):
+            raise InputError(f"{name}: cells must be in [0, 2^{depth}); got {int(cells.min())} .. {int(cells.max())}")
         stages = [dataclasses.replace(stage, patches=stage.patches[:n_curves]) for stage in made.stages]
         return dataclasses.replace(made, stages=tuple(stages))
 

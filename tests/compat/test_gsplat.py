@@ -1,6 +1,7 @@
 """gsplat's call: against plain torch, against what gsplat 1.5.3 computes in torch, and with its strategy."""
 
 import importlib.util
+import inspect
 
 import pytest
 import torch
@@ -76,6 +77,26 @@ def blend(means2d, conics, depths, opacities, colors, background):
         color, depth = color + weight[..., None] * colors[n], depth + weight * depths[n]
         light = torch.where(going, rest, light)
     return color + light[..., None] * background, 1 - light, depth
+
+
+DEFAULTS = {  # of gsplat 1.6.0, in their order; its rolling_shutter is GLOBAL
+    "near_plane": 0.01, "far_plane": 1e10, "radius_clip": 0.0, "eps2d": 0.3, "sh_degree": None, "packed": True,
+    "tile_size": None, "backgrounds": None, "render_mode": "RGB", "sparse_grad": False, "absgrad": False,
+    "rasterize_mode": "classic", "channel_chunk": 32, "distributed": False, "camera_model": "pinhole",
+    "segmented": False, "covars": None, "with_ut": False, "with_eval3d": False, "return_normals": False,
+    "global_z_order": True, "rays": None, "radial_coeffs": None, "tangential_coeffs": None, "thin_prism_coeffs": None,
+    "ftheta_coeffs": None, "lidar_coeffs": None, "external_distortion_coeffs": None, "rolling_shutter": None,
+    "viewmats_rs": None, "ut_params": None, "extra_signals": None, "extra_signals_sh_degree": None,
+    "renderer_config": None,
+}  # fmt: skip
+
+
+def test_the_signature_is_that_of_gsplat():
+    needed = ["means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "width", "height"]
+    parameters = inspect.signature(rasterization).parameters
+    assert list(parameters) == [*needed, *DEFAULTS]
+    assert {name: parameters[name].default for name in DEFAULTS} == DEFAULTS
+    assert all(parameters[name].default is inspect.Parameter.empty for name in needed)
 
 
 # ---- images and gradients against plain torch -----------------------------------------------------------------------
@@ -263,6 +284,7 @@ def test_lists_of_tiles_are_refused_by_name():
     [("with_ut", True), ("with_eval3d", True), ("rays", torch.zeros(1)), ("ftheta_coeffs", object()),
      ("lidar_coeffs", object()), ("rolling_shutter", object()), ("viewmats_rs", torch.zeros(1)), ("distributed", True),
      ("sparse_grad", True), ("global_z_order", False), ("return_normals", True), ("extra_signals", torch.zeros(1)),
+     ("extra_signals_sh_degree", 3), ("external_distortion_coeffs", object()),
      ("thin_prism_coeffs", torch.zeros(1)), ("ut_params", object()), ("renderer_config", object()),
      ("render_mode", "RGB-d"), ("camera_model", "ftheta"), ("rasterize_mode", "smooth")],
 )  # fmt: skip

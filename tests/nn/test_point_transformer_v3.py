@@ -155,6 +155,10 @@ def test_arguments_are_checked():
         model.pyramid(torch.full((1, 3), -1), cu_rows)
     with pytest.raises(InputError, match="cells must be in"):
         model.pyramid(torch.full((1, 3), 1 << 16), cu_rows)
+    with pytest.raises(InputError, match=r"cells must be in \[0, 2\^2\); got 3 \.\. 4"):
+        model.pyramid(torch.tensor([[3, 4, 3]]), cu_rows, depth=2)
+    largest = torch.full((1, 3), (1 << 16) - 1)
+    assert PointTransformerV3(config(depth_rule="count")).pyramid(largest, cu_rows).rows.tolist() == [0]
     with pytest.raises(InputError, match="cells must be int32 or int64"):
         model.pyramid(torch.zeros(1, 3), cu_rows)
     with pytest.raises(InputError, match="permutations must be 3 orders of 4"):
