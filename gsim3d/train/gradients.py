@@ -109,9 +109,8 @@ class StepWatch:
         """Registers hooks that record the gradients of each step of a rollout."""
         self._squares = [[] for _ in steps]
         for squares, step in zip(self._squares, steps, strict=True):
-            for value in step.row_fields().values():
-                if value.requires_grad:
-                    value.register_hook(partial(_note, squares))
+            for value in (value for value in step.row_fields().values() if value.requires_grad):
+                value.register_hook(partial(_note, squares))
 
     def norms(self) -> list[float]:
         """Returns the gradient norm of each step's particles, after the backward pass."""
