@@ -30,18 +30,18 @@ int main(int argc, char** argv) {
   std::ifstream file(argc == 3 ? argv[1] : "", std::ios::binary);
   std::map<Bytes, size_t> column;
   int64_t n = 0;
-  for (Bytes word; file >> word && word != "end_header";)
+  for (Bytes word, type; file >> word && word != "end_header" && word != "ascii";)
     if (word == "vertex") file >> n;
-    else if (word == "float" && file >> word) column.emplace(word, column.size());
+    else if (word == "property" && file >> type >> word) column.emplace(word, column.size()), n *= type == "float";
   std::vector<float> rows(n * column.size()), means, quats, scales, opacities, color, low(3, 1e9f), high(3, -1e9f);
-  if (!n || !file.ignore() || !file.read((char*)rows.data(), rows.size() * 4) || !column.count("f_dc_2"))
+  if (!n || !file.ignore() || !file.read((char*)rows.data(), rows.size() * 4) || !column.count("rot_3"))
     return std::cerr << "usage: render_ply IN.ply OUT.png, of a binary .ply with float properties of Gaussians\n", 1;
   for (const float* row = rows.data(); row != rows.data() + rows.size(); row += column.size()) {
-    for (const char* name : {"x", "y", "z"}) means.push_back(row[column[name]]);
-    for (const char* name : {"rot_0", "rot_1", "rot_2", "rot_3"}) quats.push_back(row[column[name]]);
-    for (const char* name : {"scale_0", "scale_1", "scale_2"}) scales.push_back(std::exp(row[column[name]]));
-    for (const char* name : {"f_dc_0", "f_dc_1", "f_dc_2"}) color.push_back(.5f + .2820948f * row[column[name]]);
-    opacities.push_back(1 / (1 + std::exp(-row[column["opacity"]])));
+    for (const char* name : {"x", "y", "z"}) means.push_back(row[column.at(name)]);
+    for (const char* name : {"rot_0", "rot_1", "rot_2", "rot_3"}) quats.push_back(row[column.at(name)]);
+    for (const char* name : {"scale_0", "scale_1", "scale_2"}) scales.push_back(std::exp(row[column.at(name)]));
+    for (const char* name : {"f_dc_0", "f_dc_1", "f_dc_2"}) color.push_back(.5f + .2820948f * row[column.at(name)]);
+    opacities.push_back(1 / (1 + std::exp(-row[column.at("opacity")])));
     for (int k = 0; k < 3; ++k) low[k] = std::min(low[k], row[k]), high[k] = std::max(high[k], row[k]);
   }
   const float x = (low[0] + high[0]) / 2, y = (low[1] + high[1]) / 2, side = std::max(high[0] - x, high[1] - y);

@@ -79,8 +79,12 @@ def render(program, folder):
     expected = rasterize_gaussians(means, quats, scales, opacities, cameras, sh=sh, background=torch.zeros(1, 3))
     image = cv2.imread(str(folder / "out.png"))[..., ::-1].astype(float)
     assert abs(image - 255 * expected.color[0].clamp(0, 1).numpy()).max() < 1 and image.max() > 50
-    (folder / "bad.ply").write_text("ply\nelement vertex 3\nend_header\n")
-    assert subprocess.run([program, folder / "bad.ply", folder / "none.png"], capture_output=True).returncode == 1
+    good = (folder / "in.ply").read_bytes()
+    wrong = {b"binary_little_endian": b"ascii", b"float opacity": b"double opacity", b" rot_3": b" other"}
+    bad = [good.replace(part, other) for part, other in wrong.items()]
+    for data in (b"ply\nelement vertex 3\nend_header\n", *bad):
+        (folder / "bad.ply").write_bytes(data)
+        assert subprocess.run([program, folder / "bad.ply", folder / "none.png"], capture_output=True).returncode == 1
 
 
 def test_installed_headers_compile_alone_and_together(prefix, tmp_path):
