@@ -38,7 +38,9 @@ def scene_of(batch=(), cameras=2, n=40, channels=3, seed=0, dtype=torch.float64)
     return {name: x.to(dtype).contiguous() for name, x in parts.items()}
 
 
-def expected_images(arguments, *, backgrounds=None, render_mode="RGB", eps2d=0.3, antialiased=False, lens="pinhole"):
+def expected_images(
+    arguments, *, backgrounds=None, render_mode="RGB", eps2d=0.3, antialiased=False, lens="pinhole", distortion=None
+):
     """[C, H, W, X] and alpha [C, H, W, 1] of one batch by the oracles; colours [N, D] or [C, N, D]."""
     means, opacities, colors = (arguments[name] for name in ("means", "opacities", "colors"))
     shapes = arguments.get("covars")
@@ -47,8 +49,9 @@ def expected_images(arguments, *, backgrounds=None, render_mode="RGB", eps2d=0.3
     images, alphas = [], []
     for i, (viewmat, K) in enumerate(zip(arguments["viewmats"], arguments["Ks"])):
         means2d, conics, depths, compensations, _ = projection_oracle.project(
-            means, shapes, viewmat, K, 45, 37, lens=lens, distortion=torch.zeros(8), dilation=eps2d, clamped=True
-        )
+            means, shapes, viewmat, K, 45, 37, lens=lens,
+            distortion=torch.zeros(8) if distortion is None else distortion[i], dilation=eps2d, clamped=True,
+        )  # fmt: skip
         opacity = opacities * compensations if antialiased else opacities
         of_view = colors[i] if colors.dim() == 3 else colors
         seen = depths > 0.01
@@ -204,15 +207,36 @@ def test_cameras_are_cast_to_the_dtype_of_the_means():
     assert_same_bits(rasterization(**arguments | cameras, **SIZE, sh_degree=1)[0], expected)
 
 
-def test_distorted_cameras(device):
-    arguments = {name: x.to(device) for name, x in scene_of(cameras=1).items()}
-    radial = torch.tensor([[0.1, 0.02, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64, device=device).requires_grad_()
-    tangential = torch.tensor([[0.01, -0.01]], dtype=torch.float64, device=device).requires_grad_()
-    color, *_ = rasterization(**arguments, **SIZE, radial_coeffs=radial, tangential_coeffs=tangential)
-    straight, *_ = rasterization(**arguments, **SIZE)
-    assert relative(color, straight) > 1e-2
-    for grad in torch.autograd.grad((color**2).sum(), (radial, tangential)):
+@pytest.mark.parametrize(
+    ("camera_model", "n_radial", "n_tangential"),
+    [("pinhole", 6, 2), ("pinhole", 6, 0), ("pinhole", 4, 0), ("pinhole", 0, 2), ("fisheye", 4, 0)],
+)
+def test_distorted_cameras(device, camera_model, n_radial, n_tangential):
+    arguments = scene_of()
+    radial = torch.tensor([[0.1, 0.02, 0.01, -0.02, 0.03, 0.01], [0.05, -0.01, 0.0, 0.02, 0.0, 0.0]]).double()
+    tangential = torch.tensor([[0.01, -0.01], [-0.02, 0.01]]).double()
+    given = {"radial_coeffs": radial[:, :n_radial], "tangential_coeffs": tangential[:, :n_tangential]}
+    given = {name: x.to(device).requires_grad_() for name, x in given.items() if x.shape[1]}
+    radial[:, n_radial:], tangential[:, n_tangential:] = 0, 0
+    in_order = radial if camera_model == "fisheye" else torch.cat([radial[:, :2], tangential, radial[:, 2:]], 1)
+    lens = "opencv" if camera_model == "pinhole" else camera_model
+    expected, _ = expected_images(arguments, lens=lens, distortion=in_order)
+    moved = {name: x.to(device) for name, x in arguments.items()}
+    color, *_ = rasterization(**moved, **SIZE, camera_model=camera_model, **given)
+    assert_close_relative_to_max(color, expected, "raster_float64")
+    assert relative(color, rasterization(**moved, **SIZE, camera_model=camera_model)[0]) > 1e-2
+    for grad in torch.autograd.grad((color**2).sum(), given.values()):
         assert grad.abs().max() > 0
+
+
+@pytest.mark.parametrize(
+    ("camera_model", "name", "size"),
+    [("ortho", "radial_coeffs", 6), ("ortho", "tangential_coeffs", 2), ("fisheye", "tangential_coeffs", 2)],
+)
+def test_coefficients_of_other_lenses_are_refused(camera_model, name, size):
+    given = {name: torch.zeros(2, size, dtype=torch.float64)}
+    with pytest.raises(InputError, match="tangential_coeffs of pinhole"):
+        rasterization(**scene_of(), **SIZE, camera_model=camera_model, **given)
 
 
 def relative(a, b):
