@@ -116,7 +116,7 @@ def project_gaussians(
     n, n_images = means.shape[0], cameras.viewmats.shape[0]
     if cu_rows is None:
         cu_rows = torch.tensor([0, n], device=means.device)
-        n_pairs = n * n_images
+        n_pairs = n * n_images if n_pairs is None else n_pairs
     counts = F.pad(cu_rows[1:] - cu_rows[:-1], (0, 1))  # a cloud that is none has no rows
     cu_pairs = F.pad(counts[cameras.image_cloud.clamp(0, len(counts) - 1)].cumsum(0), (1, 0))
     if n_pairs is None:

@@ -444,6 +444,8 @@ def test_errors_name_the_argument():
         call(near_plane=2.0, far_plane=1.0)
     with pytest.raises(ValueError, match="n_pairs must be"):
         call(n_pairs=3)
+    with pytest.raises(ValueError, match="n_pairs must be"):
+        call(n_pairs=3, cu_rows=None, cameras=cameras.select(torch.tensor([1])))
     with pytest.raises(ValueError, match="image_cloud must be in"):
         call(cameras=dataclasses.replace(cameras, image_cloud=torch.tensor([0, 1, 2])))
     with pytest.raises(NumericalError, match="means must be finite"):
