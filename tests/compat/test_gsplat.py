@@ -276,6 +276,10 @@ def test_packed_meta_lists_what_is_seen(device):
     packed_color, _, packed = rasterization(**arguments, **SIZE)
     assert_same_bits(packed_color, color)
     assert whole["batch_ids"] is whole["camera_ids"] is whole["gaussian_ids"] is None
+    unseen = (whole["radii"] == 0).any(-1)
+    for name in ("means2d", "radii", "depths", "conics"):
+        assert whole[name][unseen].abs().max() == 0
+    assert (whole["opacities"][unseen] > 0).all()
     at = (packed["batch_ids"], packed["camera_ids"], packed["gaussian_ids"])
     assert len(at[0]) == (whole["radii"] > 0).all(-1).sum() < whole["radii"][..., 0].numel()
     for name in ("means2d", "radii", "depths", "conics", "opacities"):
