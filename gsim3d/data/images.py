@@ -20,6 +20,7 @@ IMAGE_SUFFIXES = (".png", ".tif", ".tiff", *LOSSY_SUFFIXES)
 MAX_FILE = 1 << 29  # bytes
 HEADER = 1 << 16  # bytes; enough for most image headers
 MAX_ID = 16  # masks with only smaller values are taken to hold body ids
+MAX_DARK = 4095  # images of 16 bits without larger values are taken to have 8, 10 or 12 bits
 MAX_SOFT = 0.2  # largest fraction of mask pixels with values near half of the range
 MAX_LABELS, MAX_SMALL = 256, 8  # masks with more distinct values are not label images, also of bodies of few pixels
 
@@ -91,8 +92,11 @@ def header_of(file: Path, frame: str, problems: Problems) -> Header | None:
 
 def as_color(image: np.ndarray, file: Path, frame: str, problems: Problems) -> np.ndarray | None:
     """Converts to uint8 RGB [h, w, 3]: grey is replicated, 16 bits are rounded to 8, alpha is composited on black."""
-    if image.dtype == np.uint16 and 0 < image.max() <= 255:
-        problems.add(f"image {file} ({frame}) has 16 bits a channel, but no value above 255; save it with 8 bits")
+    if image.dtype == np.uint16 and 0 < image.max() <= MAX_DARK:
+        problems.add(
+            f"image {file} ({frame}) has 16 bits a channel, but no value above {image.max()}; scale its values to 16 "
+            "bits, or save it with 8"
+        )
         return None
     image = _over_black(image)
     if image.dtype == np.uint16:
@@ -166,26 +170,29 @@ def _marked(grey: np.ndarray, lossy: bool) -> np.ndarray | None:
     levels = np.flatnonzero(np.bincount(grey.ravel()))
     low, high = int(levels[0]), int(levels[-1])
     full = np.iinfo(grey.dtype).max
-    if high == 0 or (high < MAX_ID and not lossy) or _are_labels(grey, levels, lossy):
+    if high == 0 or (not lossy and (high < MAX_ID or _are_labels(grey, levels))):
         return grey > 0
     if len(levels) == 1 or lossy:  # lossy compression keeps 0 and 255, but adds values between
         low, high = 0, full
-    soft = (grey > low + (high - low) // 4) & (grey < high - (high - low) // 4)
+    upper, step = high - (high - low) // 4, (high - low) // 16
+    soft = (grey > low + (high - low) // 4) & (grey < upper)
     block = np.ones((5, 5), np.uint8)  # wider than soft borders of JPEG chroma at half resolution
     wide = cv2.erode(soft.astype(np.uint8), block, borderType=cv2.BORDER_REPLICATE)
-    if soft.mean() > MAX_SOFT or wide.any() or (lossy and not (grey > high - (high - low) // 4).any()):
+    least, most = cv2.erode(grey, block), cv2.dilate(grey, block)
+    flat = (least > low + step) & (most - least <= step) & (most < upper)  # compression noise is not
+    if soft.mean() > MAX_SOFT or wide.any() or flat.any() or (lossy and not (grey > upper).any()):
         return None
     return grey > (low + high) // 2
 
 
-def _are_labels(grey: np.ndarray, levels: np.ndarray, lossy: bool) -> bool:
+def _are_labels(grey: np.ndarray, levels: np.ndarray) -> bool:
     """Returns whether most intermediate values form flat regions, unlike noise and soft borders."""
     inner = levels[1:-1]
     if not 0 < len(inner) <= MAX_LABELS:
         return False
     flat = cv2.erode(grey, np.ones((3, 3), np.uint8)) == cv2.dilate(grey, np.ones((3, 3), np.uint8))
     are_flat = 2 * np.isin(inner, grey[flat]).sum() >= len(inner)
-    if are_flat or lossy or len(inner) > MAX_SMALL:
+    if are_flat or len(inner) > MAX_SMALL:
         return are_flat
     small, wide = np.ones((2, 2), np.uint8), np.ones((7, 7), np.uint8)  # a body of few pixels, apart from others
     alone = (cv2.erode(grey, small) == cv2.dilate(grey, small)) & (cv2.dilate(grey, wide) < levels[-1])

@@ -87,11 +87,26 @@ def test_as_mask_refuses_photos(tmp_path):
     cv2.rectangle(three, (40, 5), (60, 15), 120, -1)
     three_lossy = stored(tmp_path, "m.jpg", three)
     for image, name in ((ramp, "m.png"), (noise, "m.png"), (three_lossy, "m.jpg"), (three_lossy, "m.png"),
-                        (discs(100), "m.jpg"), (discs(2), "m.jpg"), (np.full_like(ramp, 120), "m.png")):  # fmt: skip
+                        (discs(100), "m.jpg"), (discs(2), "m.jpg"),
+                        (three // 40, "m.jpg"), (np.full_like(ramp, 120), "m.png")):  # fmt: skip
         with pytest.raises(InputError, match=rf"{name} \(camera a, frame 0\) is not a mask"):
             moving(image, tmp_path / name)
     assert not moving(np.zeros_like(ramp), tmp_path / "m.jpg").any()
     assert moving(np.full_like(ramp, 255), tmp_path / "m.jpg").all()
+
+
+@pytest.mark.parametrize(
+    "name, quality", [("m.jpg", 95), ("m.jpg", 80), ("m.webp", 80), ("m.webp", 101), ("m.png", 95)]
+)
+@pytest.mark.parametrize("ids", [(40, 200), (60, 255), (30, 250)])
+def test_as_mask_refuses_lossy_labels(tmp_path, name, quality, ids):
+    """Thresholded at half, the smaller label would be lost."""
+    labels = discs(ids[1])
+    cv2.circle(labels, (50, 8), 7, ids[0], -1)
+    kind = cv2.IMWRITE_WEBP_QUALITY if name == "m.webp" else cv2.IMWRITE_JPEG_QUALITY
+    image = stored(tmp_path, "m.jpg" if name == "m.png" else name, labels, kind, quality)
+    with pytest.raises(InputError, match=rf"{name} \(camera a, frame 0\) is not a mask"):
+        moving(image, tmp_path / name)
 
 
 def test_scene_with_jpeg_masks(tmp_path):
@@ -278,9 +293,9 @@ def test_cmyk_and_animated_images_are_refused(tmp_path):
             read_image(tmp_path / name, SIZE, "", Problems())
 
 
-@pytest.mark.parametrize("values", [1, 255])
-def test_16_bit_images_of_8_bit_values_are_refused(tmp_path, values):
+@pytest.mark.parametrize("values", [1, 255, 1023, 4095])
+def test_16_bit_images_of_8_to_12_bit_values_are_refused(tmp_path, values):
     image = stored(tmp_path, "m.png", discs(values, np.uint16))
-    with pytest.raises(InputError, match="m.png .*no value above 255; save it with 8 bits"):
+    with pytest.raises(InputError, match=f"m.png .*no value above {values}; scale"):
         as_color(image, tmp_path / "m.png", "camera a, frame 0", Problems())
     assert not as_color(image * 0, tmp_path / "m.png", "", Problems()).any()
