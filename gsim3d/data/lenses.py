@@ -31,11 +31,14 @@ FISHEYE = {
 }
 # Other names of lens models and coefficients, compared without case, underscores and hyphens. Set values are an error.
 OTHER_KEY = re.compile(
-    r"[sbp][1-4]|sx1|sy1|tau[xy]|omega|xi|skew|k[1-6]|kappa\d?|d|dist|distcoef.*|radial|tangential|"
-    r"lens(coef.*|params)?|.*(distort|fisheye|equirect|latlong|rollingshutter|ftheta).*"
+    r"[sbp][1-4]|sx1|sy1|tau[xy]|omega|xi|skew|k\d+|kappa\d?|d|dist|distcoef.*|radial|tangential|"
+    r"lens(coef.*|params)?|ortho(graphic|scale)?|.*(distort|fisheye|equirect|latlong|rollingshutter|ftheta).*"
 )
 MODEL_KEY = re.compile(r"(camera|lens|projection|distortion)?(type|model|mode|projection)|lens")
-OTHER_MODEL = re.compile(r"fish|equi|omni|ftheta|spher|panoram|latlong|kannala|prism|^(kb\d?|mei|ds|eucm|ucm|fov)$")
+OTHER_MODEL = re.compile(
+    r"fish|orth|equi|omni|ftheta|spher|panoram|latlong|kannala|prism|^(kb\d?|mei|ds|eucm|ucm|fov)$"
+)
+MAX_PARTS = 100  # of a list that are searched for lens keys
 SAMPLES = 2000  # angles at which the distorted radius is sampled
 WIDEST = 1.55  # radians from the optical axis; a pinhole image covers less than 90 degrees
 
@@ -61,6 +64,9 @@ def lens_of(values: Mapping, what: str, problems: Problems) -> Lens | None:
         problems.add(f"{what}: camera_model is {model}, but is_fisheye is true; remove one of them")
         return None
     numbers = _coefficients(values, what, problems)
+    if "distortion_params" in values and numbers["k4"] and model not in FISHEYE:
+        problems.add(f"{what}: k4 in distortion_params, a factor of r^8, is not supported; undistort the images")
+        return None
     extra = next((key for key in COEFFICIENTS if numbers[key] and key not in known[model]), None)
     if extra:
         problems.add(f"{what}: camera_model {model} has no {extra}, but it is {numbers[extra]:g}")
@@ -82,8 +88,10 @@ def _unread(values: Mapping, level: int = 0) -> str | None:
         is_name = is_model and isinstance(value, str)
         if OTHER_MODEL.search(_plain(value)) if is_name else is_other and _is_set(value):
             return str(key)
-        if isinstance(value, Mapping) and level < 3 and (inner := _unread(value, level + 1)):
-            return f"{key}.{inner}"
+        parts = value[:MAX_PARTS] if isinstance(value, list) else [value]
+        for part in parts if level < 3 else ():
+            if isinstance(part, Mapping) and (inner := _unread(part, level + 1)):
+                return f"{key}.{inner}"
     return None
 
 

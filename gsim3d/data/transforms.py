@@ -105,10 +105,10 @@ def frames_of(folder: Path, source: Path, description: dict) -> list[dict]:
     frames = description.get("frames")
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise InputError(f"{source}: frames must be a list of one or more JSON objects")
+    if isinstance(description.get("camera"), dict):
+        raise InputError(f"{source}: camera must not be an object; give its keys (fl_x, k1 ...) at the top level")
     for number, frame in enumerate(frames):
-        for key in ("file_path", "mask_path", "label_path"):
-            if key != "file_path" and key not in frame:
-                continue
+        for key in ("file_path", *(key for key in ("mask_path", "label_path") if key in frame)):
             if not isinstance(frame.get(key), str):
                 raise InputError(f"{source}: frames[{number}].{key} must be a string; got {str(frame.get(key))[:80]!r}")
             inside(folder, frame[key], f"{source}: frames[{number}].{key}")
@@ -211,7 +211,7 @@ class _CameraFrames:
 
     def _file(self, key: str, step: int) -> tuple[Path, str]:
         file = inside(self._folder, self.frames[step][key], f"{self._source}: {key} of {self.frame(step)}")
-        if file.suffix.lower() not in IMAGE_SUFFIXES:  # NeRF-synthetic omits the suffix
+        if file.suffix.lower() not in IMAGE_SUFFIXES and not file.is_file():  # NeRF-synthetic omits the suffix
             found = [file.with_name(file.name + suffix) for suffix in IMAGE_SUFFIXES]
             file = next((path for path in found if path.is_file()), found[0])
         return file, self.frame(step)

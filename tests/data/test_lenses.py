@@ -106,6 +106,12 @@ REFUSED = [
     ({"k1": None}, "k1 contains null"),
     ({"k2": "0.1"}, "k2 must be numbers"),
     ({"distortion_params": [0.1]}, "distortion_params"),
+    ({"distortion_params": [0.1, 0, 0, 0.3, 0, 0]}, "k4 in distortion_params"),
+    ({"k7": 0.1}, "the lens key k7"),
+    ({"camera_type": "ORTHO"}, "camera_type"),
+    ({"orthographic": True}, "orthographic"),
+    ({"ortho_scale": 2.5}, "ortho_scale"),
+    ({"sensors": [{"name": "a"}, {"k1": 0.1}]}, "sensors.k1"),
 ]
 
 

@@ -217,6 +217,26 @@ def test_transforms_frames_of_one_camera_need_times(tmp_path):
         Scene.open(tmp_path)
 
 
+def test_transforms_name_files_of_other_formats(tmp_path):
+    write_transforms(tmp_path, make_scene(n_steps=1))
+    for file in list(tmp_path.glob("images/*/*.png")):
+        file.rename(file.with_suffix(".bmp"))
+    edit_json(
+        tmp_path / "transforms.json",
+        lambda content: [f.update(file_path=f["file_path"].replace(".png", ".bmp")) for f in content["frames"]],
+    )
+    (tmp_path / "images/cam_0/frame_00001.bmp").write_bytes(b"BM" + bytes(100))
+    with pytest.raises(InputError, match=r"frame_00001.bmp \(.*no PNG, JPEG, WebP or TIFF"):
+        Scene.open(tmp_path).images([0], [0])
+
+
+def test_transforms_cameras_are_no_objects(tmp_path):
+    write_transforms(tmp_path, make_scene(n_steps=1))
+    edit_json(tmp_path / "transforms.json", lambda content: content.update(camera={"k1": 0.1}))
+    with pytest.raises(InputError, match="camera must not be an object"):
+        Scene.open(tmp_path)
+
+
 @pytest.mark.parametrize("text", [
     rb'{"frames": [{"file_path": "\xff.png"}]}', rb'{"frames": [{"file_path": "a\ud800.png"}]}',
     rb'{"frames": [], "na\udc80me": 1}', b'{"frames": [{"file_path": "\xed\xa0\x80.png"}]}',
