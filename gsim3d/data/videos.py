@@ -14,19 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gsim3d.data import recording
+from gsim3d.data import images, recording
 from gsim3d.data.cameras import check_intrinsics, check_pose
-from gsim3d.data.images import (
-    IMAGE_SUFFIXES,
-    as_color,
-    as_labels,
-    as_mask,
-    as_opaque,
-    header_of,
-    is_opaque,
-    read_files,
-    read_image,
-)
 from gsim3d.data.lenses import FISHEYE, FISHEYE_ORDER, OPENCV_ORDER, lens_of
 from gsim3d.data.masks import MIN_STEPS
 from gsim3d.data.recording import Camera, Description, Lens, Problems, Recording, array, inside
@@ -42,9 +31,10 @@ NEAR_NAME, MAX_OTHERS = 0.8, 100  # similarity at which a key is taken for a mis
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 DISTORTIONS = [(4,), (5,), (8,)]
 OWN_FOLDERS = ("masks", "labels")  # reserved, not camera names
-CONVERT = {"labels": as_labels, "alpha": as_opaque}  # others are masks
+CONVERT = {"labels": images.as_labels, "alpha": images.as_opaque}  # others are masks
 SAME_RATE = 5e-3  # relative; 29.97 and 30 fps count as equal
 MAX_RESAMPLING = 100  # steps per recorded frame of resampled videos
+OFF_STEP = 0.1  # frames; larger differences between cameras and their steps are noted
 MAX_DRIFT = 0.5  # frames; largest drift between videos of nearly equal rates
 
 
@@ -80,7 +70,8 @@ def read(folder: Path, problems: Problems) -> Recording:
         return sources[names[cam]].read([numbers[cam][step] for step in steps], problems)
 
     def read_labels(cam: int, steps: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:
-        return labels[names[cam]].read([numbers[cam][step] for step in steps], problems, CONVERT.get(masks, as_mask))
+        convert = CONVERT.get(masks, images.as_mask)
+        return labels[names[cam]].read([numbers[cam][step] for step in steps], problems, convert)
 
     found = Recording.of_cameras(
         cameras,
@@ -121,7 +112,8 @@ def _entries(description: Description) -> dict[str, Description]:
         if misplaced := next((key for key in SHARED_KEYS if key in entry), None):
             raise InputError(f"{where}{misplaced} belongs to the top level: all cameras have the same")
         for key in sorted(set(values).difference(KEYS))[:MAX_OTHERS]:
-            if meant := difflib.get_close_matches(key[:100], KEYS, 1, NEAR_NAME):
+            words = [word for word in key[:100].split("_") if word in ("fps", "offset", "near", "far")]
+            if meant := difflib.get_close_matches(key[:100], KEYS, 1, NEAR_NAME) or words:
                 raise InputError(f"{where}{key:.80} is no key of this file; did you mean {meant[0]}?")
         found[name] = Description(values, where, description.problems)
     return found
@@ -247,8 +239,14 @@ def _steps(
         n_steps = max(map(len, numbers.values()), default=1)
         return [numbers.get(name, [0] * n_steps) for name in sources], resample, notes + more
     rate = fps or own_rate or 1.0
-    first = {name: round((video.times[0] + offsets[name]) * (video.rate or 0)) for name, video in videos.items()}
-    first |= {name: round(offsets[name] * rate) for name in folders}
+    starts = {name: (video.times[0] + offsets[name]) * (video.rate or 0) for name, video in videos.items()}
+    starts |= {name: offsets[name] * rate for name in folders}
+    # Steps have the mean phase of the cameras: of starts at 0.49 and 0.51 frames, none is rounded away from the other.
+    phase = np.angle(sum(np.exp(2j * np.pi * start) for start in starts.values())) / (2 * np.pi)
+    first = {name: round(start - phase) for name, start in starts.items()}
+    off = max((abs(starts[name] - phase - first[name]) for name in starts), default=0.0)
+    if off > OFF_STEP:
+        notes.append(f"frames are up to {1000 * off / rate:.3g} ms off their steps")
     ticks = {name: [first[name] + number for number in sources[name].numbers] for name in sources if name in first}
     if any(first.values()):
         low, high = max(own[0] for own in ticks.values()), min(own[-1] for own in ticks.values())
@@ -302,7 +300,7 @@ class _Frames:
         self._name, self._size, self._folder = name, size, scene / folder
         self._files: dict[int, Path] = {}
         for path in sorted(self._folder.iterdir()) if self._folder.is_dir() else ():
-            number = recording.trailing_number(path.stem) if path.suffix.lower() in IMAGE_SUFFIXES else None
+            number = recording.trailing_number(path.stem) if path.suffix.lower() in images.IMAGE_SUFFIXES else None
             if number is None:
                 continue
             if number in self._files:
@@ -313,13 +311,13 @@ class _Frames:
     def is_cut_out(self) -> bool:
         """Returns whether the first image has transparent pixels."""
         for number in self.numbers[:1]:
-            header = header_of(self._files[number], self._name, Problems(collect=True))
+            header = images.header_of(self._files[number], self._name, Problems(collect=True))
             if header is not None and header.alpha and header.size == self._size:
-                image = read_image(self._files[number], self._size, self._name, Problems(collect=True))
-                return image is not None and not is_opaque(image).all()
+                image = images.read_image(self._files[number], self._size, self._name, Problems(collect=True))
+                return image is not None and not images.is_opaque(image).all()
         return False
 
-    def read(self, numbers: Sequence[int], problems: Problems, convert=as_color) -> Iterator[np.ndarray | None]:
+    def read(self, numbers: Sequence[int], problems: Problems, convert=images.as_color) -> Iterator[np.ndarray | None]:
         """Reads and converts the images with these numbers; yields None on error."""
         if not self._files:  # already reported when the scene was opened
             yield from [None] * len(numbers)
@@ -330,4 +328,4 @@ class _Frames:
                 problems.add(f"{self._folder}: the image of {frame} is missing")
                 yield None
                 continue
-            yield from read_files(iter([(self._files[number], frame)]), self._size, convert, problems)
+            yield from images.read_files(iter([(self._files[number], frame)]), self._size, convert, problems)

@@ -305,6 +305,9 @@ MISTAKES = {
     "pixel_centre": ({"pixel_centre": 0}, {}, "pixel_centre is no key of this file; did you mean pixel_center?"),
     "unit": ({"unit": "mm"}, {}, "unit is no key of this file; did you mean units?"),
     "distorsion": ({}, {"distorsion": [0.1, 0, 0, 0]}, "distorsion is"),
+    "time_offset": ({}, {"time_offset": 0.1}, "time_offset is .* did you mean offset?"),
+    "video_fps": ({"video_fps": 25}, {}, "video_fps is .* did you mean fps?"),
+    "near_plane": ({"near_plane": 0.1}, {}, "near_plane is .* did you mean near?"),
     "units of a camera": ({}, {"units": "mm"}, "camera .*: units belongs to the top level"),
     "near of a camera": ({}, {"near": 2.0}, "camera .*: near belongs to the top level"),
 }

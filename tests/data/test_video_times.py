@@ -11,6 +11,7 @@ from gsim3d.data import Scene
 from gsim3d.data.check import check_scene, describe
 from gsim3d.errors import InputError
 from gsim3d.io import write_video
+from tests.data.made_scenes import edit_json
 from tests.data.made_videos import (
     N_FRAMES,
     RATE,
@@ -109,6 +110,28 @@ def test_late_videos_are_aligned_by_time(tmp_path):
     assert frames_of(resampled) == [list(range(6, 20, 2)), list(range(0, 14, 2)), list(range(6, 20, 2))]
     alone = Scene.open(write_scene(tmp_path, ["b"]))
     assert frames_of(alone) == [list(range(20))] and alone.recording.notes == ()
+
+
+@pytest.mark.parametrize("offsets, off", [([0.024, 0.026], 0), ([0.0, 0.012], 6), ([0.12, 0.13, 0.125], 5)])
+@pytest.mark.parametrize("kind", ["films", "folders"])
+def test_offsets_of_fractions_of_a_frame(tmp_path, kind, offsets, off):
+    """Offsets of 0.48 and 0.52 frames are not rounded to different steps."""
+    names = [f"c{number}" for number in range(len(offsets))]
+    for name in names:
+        write_plain(tmp_path / f"{name}.mp4")
+        if kind == "folders":
+            (tmp_path / name).mkdir()
+            for number in range(20):
+                cv2.imwrite(str(tmp_path / name / f"{number}.png"), np.full((48, 64, 3), 12 * number, np.uint8))
+            (tmp_path / f"{name}.mp4").unlink()
+    folder = write_scene(tmp_path, names, fps=RATE)
+    edit_json(
+        folder / "cameras.json",
+        lambda content: [camera.update(offset=x) for camera, x in zip(content["cameras"], offsets, strict=True)],
+    )
+    scene = Scene.open(folder)
+    assert frames_of(scene) == [list(range(20))] * len(offsets)
+    assert scene.recording.notes == ((f"frames are up to {off} ms off their steps",) if off else ())
 
 
 def test_labels_of_late_videos_have_their_own_frame_numbers(tmp_path):
