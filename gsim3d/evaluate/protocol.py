@@ -72,26 +72,26 @@ def default_views(
     """Returns (context, target) cameras; raises InputError if too few are left as inputs.
 
     Args:
-        context: input cameras. Default: as many as in training, evenly spaced, without ``target``.
+        context: different input cameras. Default: as many as in training, evenly spaced, without ``target``.
         target: target cameras. Default: those that training excluded from inputs, else all that are not inputs.
     """
-    data = restored.data_of(scene)
+    data, trained, least = restored.data_of(scene), restored.data.context_views, len(context or ())
     if not context:
+        least = min(2, trained)
         cameras = [cam for cam in context_cameras(scene, data) if cam not in (target or ())]
-        count = min(data.context_views, len(cameras))
-        if count < min(2, restored.data.context_views):
-            raise InputError(
-                f"{scene.path}: {len(cameras)} cameras left as inputs; training used {restored.data.context_views} "
-                "views (set inputs with --context)"
-            )
-        context = spread_views(cameras, count, 0)
-        if count < restored.data.context_views:
-            warnings.warn(
-                f"fitted to the model: {count} input views, cameras {' '.join(map(str, context))}; training used "
-                f"{restored.data.context_views} (set inputs with --context)",
-                FitWarning,
-                stacklevel=2,
-            )
+        context = spread_views(cameras, min(data.context_views, len(cameras)), 0)
+    if len(set(context)) < least:
+        raise InputError(
+            f"{scene.path}: {len(set(context))} cameras left as inputs; training used {trained} views (set inputs with "
+            "--context, each once)"
+        )
+    if len(context) < trained:
+        warnings.warn(
+            f"fitted to the model: {len(context)} input views, cameras {' '.join(map(str, context))}; training used "
+            f"{trained} (set inputs with --context)",
+            FitWarning,
+            stacklevel=2,
+        )
     if not target:
         rest = tuple(cam for cam in range(scene.n_cams) if cam not in context)
         target = data.target_only_cameras or rest or context

@@ -128,7 +128,8 @@ class Trust:
         for name, (mean, deviation) in self.ranges.items():
             value, reach = measures.get(name, math.nan), self.threshold * deviation
             if not abs(value - mean) <= reach:
-                found.append(f"{name} {value:.4g} (validated: {mean - reach:.4g} to {mean + reach:.4g})")
+                shown = f"no {name}" if math.isnan(value) else f"{name} {value:.4g}"
+                found.append(f"{shown} (validated: {mean - reach:.4g} to {mean + reach:.4g})")
         return found
 
 
@@ -272,28 +273,28 @@ def _measures(simulator: Any, frames: Frames, state: Particles, cloud: int) -> d
     body = shown if frames.dynamic is None else shown & frames.dynamic[chosen]
     ground = shown & ~body
     moving, still = (particles.means[particles.activity == kind].double() for kind in (DYNAMIC, FROZEN))
+    base = 0.0 if frames.world_offset is None else frames.world_offset[state.clouds.scenes[cloud], 2]  # of the files
     values = {f"{name} pixels [%]": 100 * mask.double().mean() for name, mask in (("body", body), ("ground", ground))}
     if len(moving):
         values["body radius [m]"] = (moving - moving.mean(0)).square().sum(-1).mean().sqrt()
     if len(still):
-        values["ground height [m]"] = still[:, 2].median()
+        values["ground height [m]"] = still[:, 2].median() + base
     if bool(ground.any()):
         colors = images.movedim(1, -1)[ground].double()
         values |= {f"ground {name}": colors[:, k].mean() for k, name in enumerate(("red", "green", "blue"))}
     with simulator.setting.precision("renderer", images.device.type):
         rendered = simulator.render(particles, cameras).color.movedim(-1, 1).clamp(0, 1)
     error = (rendered - images).double().square().mean(1)[shown].mean()
-    values["re-rendering PSNR [dB]"] = -10 * error.clamp(min=1e-10).log10()
-    values |= _camera_measures(cameras)
+    values |= {"re-rendering PSNR [dB]": -10 * error.clamp(min=1e-10).log10(), **_camera_measures(cameras, base)}
     return dict(zip(values, torch.stack([v.cpu() for v in values.values()]).tolist(), strict=True))
 
 
-def _camera_measures(cameras: Cameras) -> dict[str, Tensor]:
+def _camera_measures(cameras: Cameras, base: Tensor | float) -> dict[str, Tensor]:
     rotations, translations = cameras.viewmats[:, :3, :3].double(), cameras.viewmats[:, :3, 3:].double()
     places, forward = -(rotations.mT @ translations)[..., 0], rotations[:, 2]
     first, second = torch.triu_indices(len(places), len(places), 1, device=places.device)
     values = {
-        "camera height [m]": places[:, 2].mean(),
+        "camera height [m]": places[:, 2].mean() + base,
         "camera pitch [degrees]": torch.rad2deg(forward[:, 2].clamp(-1, 1).asin()).mean(),
         "field of view [degrees]": torch.rad2deg(2 * (cameras.height / 2 / cameras.Ks[:, 1, 1].double()).atan()).mean(),
         "near depth [m]": cameras.near.double().mean(),
@@ -313,6 +314,5 @@ def check_input(simulator: Any, frames: Frames, state: Particles, names: Sequenc
         return
     for scene, measures in enumerate(input_measures(simulator, frames, state)):
         if found := simulator.trust.unfamiliar(measures):
-            name = names[scene] if names else f"scene {scene}"
-            said = f"{name}: unlike the validation scenes, predictions may be wrong: {'; '.join(found)}"
-            warnings.warn(said, UnfamiliarInput, stacklevel=3)
+            said = f"unlike the validation scenes, predictions may be wrong: {'; '.join(found)}"
+            warnings.warn(f"{names[scene] if names else f'scene {scene}'}: {said}", UnfamiliarInput, stacklevel=3)

@@ -75,6 +75,7 @@ BAD = {
     "inf": lambda x: torch.where(x == x.max(), torch.inf, x),
     "int64": lambda x: (x * 255).long(),
     "int8": lambda x: (x * 100).to(torch.int8),
+    "cast_to_bytes": lambda x: x.round().to(torch.uint8),
     "uint16": lambda x: (x * 65535).to(torch.int32).to(torch.uint16),
     "bool": lambda x: x > 0.5,
     "complex": lambda x: x.to(torch.complex64),
@@ -88,7 +89,7 @@ def test_images_of_another_range_or_dtype_are_refused(metric, what):
     good = images(0, 2, 12, 13, 3)
     bad = BAD[what](good)
     for arguments, name in (((bad, good), "pred"), ((good, bad), "target")):
-        with pytest.raises(InputError, match=f"^{name}: (colours must be in|must be)"):
+        with pytest.raises(InputError, match=f"^{name}: (colours (must be in|are 0 and 1 of 255)|must be)"):
             metric(*arguments)
 
 

@@ -93,7 +93,15 @@ def test_one_camera_is_refused_unless_it_is_named(restored, tmp_path):
     scene, _ = opened(restored, rig(tmp_path / "scene", 1))
     with pytest.raises(InputError, match="1 cameras left as inputs"):
         default_views(restored, scene)
-    assert default_views(restored, scene, (0,)) == ((0,), (0,))
+    with pytest.warns(FitWarning, match="1 input views, cameras 0; training used 4"):
+        assert default_views(restored, scene, (0,)) == ((0,), (0,))
+
+
+@pytest.mark.parametrize("context", [(0, 0), (1, 2, 1), (3, 2, 1, 0, 3)])
+def test_named_cameras_are_different(restored, tmp_path, context):
+    scene, _ = opened(restored, rig(tmp_path / "scene", 4))
+    with pytest.raises(InputError, match=f"{len(set(context))} cameras left .*--context, each once"):
+        default_views(restored, scene, context)
 
 
 def test_small_images_are_enlarged_with_a_warning(restored, tmp_path):

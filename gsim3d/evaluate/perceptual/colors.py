@@ -23,6 +23,8 @@ def check_colors(images: Tensor, name: str) -> None:
     if not isinstance(images, Tensor):
         raise InputError(f"{name}: must be a tensor; got {type(images).__name__}")
     if images.dtype == torch.uint8 or not images.numel():
+        if images.numel() and images.max() == 1:
+            raise InputError(f"{name}: colours are 0 and 1 of 255; give float images in [0, 1] as they are")
         return
     if not images.is_floating_point():
         raise InputError(f"{name}: must be uint8, or floating point in [0, 1]; got {images.dtype}")
