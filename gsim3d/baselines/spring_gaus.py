@@ -18,15 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from gsim3d.baselines.spring_mass import (
-    Springs,
-    SpringState,
-    advance_safely,
-    bind,
-    build_springs,
-    friction,
-    softness,
-)
+from gsim3d.baselines.spring_mass import Springs, SpringState, advance_safely, bind, build_springs, friction, softness
 from gsim3d.cameras import Cameras
 from gsim3d.data import Scene
 from gsim3d.data.recording import FIXED, MOVING

@@ -32,12 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--out", metavar="OUT", required=True, help="run folder, created or continued")
     add_calibration(parser)
     add("--minutes", type=number(0, 1e5, above=True), default=15.0, help="time to train (default: 15)")
-    add(
-        "--depth",
-        nargs=2,
-        metavar=("MODEL", "FILE"),
-        help="pretrained depth: its encoder.vit.model and weights",
-    )
+    add("--depth", nargs=2, metavar=("MODEL", "FILE"), help="pretrained depth: its encoder.vit.model and weights")
     add("--device", choices=("cpu", "cuda"), default="cpu", help="where to train (default: cpu)")
     add("--force", action="store_true", help="go on where the check refuses")
 

@@ -52,10 +52,7 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = "Scores the predictions of a simulator on the scenes of a data set."
     parser.epilog = EPILOG
-    add, checkpoint = (
-        parser.add_argument,
-        f"{CHECKPOINT_HELP} (without it, --predictions and --baselines alone)",
-    )
+    add, checkpoint = parser.add_argument, f"{CHECKPOINT_HELP} (without it, --predictions and --baselines alone)"
     cameras = {"type": whole(0), "nargs": "+", "metavar": "CAM"}
     add("checkpoint", metavar="CHECKPOINT", nargs="?", help=checkpoint)
     add("data", metavar="DATA", help="folder with scenes, or scene folder; or a report to compare with --against")

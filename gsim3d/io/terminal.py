@@ -1,6 +1,7 @@
 """Text that is safe on a terminal, and progress with the time left."""
 
 import errno
+import io
 import os
 import re
 from collections.abc import Callable
@@ -23,7 +24,7 @@ class Terminal:
     """
 
     def __init__(self, stream: Any):
-        self._stream, self._is_open = stream, True
+        self._stream, self._is_open = stream or io.StringIO(), True  # None: closed before Python began
 
     def write(self, text: str) -> int:
         begin = "\r" if text.startswith("\r") else ""
@@ -63,5 +64,4 @@ def progress(
 def in_columns(rows: list[tuple[str, ...]]) -> str:
     """A table whose columns are as wide as their longest entry."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines = ("  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)) for row in rows)
-    return "\n".join(line.rstrip() for line in lines)
+    return "\n".join("  ".join(x.ljust(w) for x, w in zip(row, widths, strict=True)).rstrip() for row in rows)

@@ -76,7 +76,8 @@ def load_body(path: str | Path, up: str = "y", *, fill_holes: bool = False) -> B
     if n_different < len(faces):
         raise InputError(f"mesh {path} has {len(faces) - n_different} duplicate faces; remove them")
     if _folded(positions, faces) > MAX_FOLDED:
-        raise InputError(f"mesh {path} has faces that fold back onto others, as of concave polygons: triangulate it")
+        what = "as of concave polygons (triangulate it) or doubled faces (remove them)"
+        raise InputError(f"mesh {path} has faces that fold back onto others, {what}")
     inwards = _turned_inwards(positions, faces)
     faces[inwards], corners[inwards] = faces[inwards, ::-1], corners[inwards, ::-1]
     return Body(path.stem, positions, faces, *cluster(positions, faces, COLLISION_VERTICES), corners, paint)
@@ -132,8 +133,8 @@ def _folded(positions: np.ndarray, faces: np.ndarray) -> float:
     away = far - start - ((far - start) * along).sum(1)[:, None] / length[:, None] * along
     away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), np.finfo(float).tiny)
     order = np.lexsort(edges.T)
-    same = (edges[order[1:]] == edges[order[:-1]]).all(1)
-    first, second = order[:-1][same], order[1:][same]
+    pairs = np.concatenate([np.stack([order[:-k], order[k:]], 1) for k in (1, 2, 3)])  # of up to four faces at an edge
+    first, second = pairs[(edges[pairs[:, 0]] == edges[pairs[:, 1]]).all(1)].T
     folded = (away[first] * away[second]).sum(1) > 1 - FLAT
     return float(area[np.unique(np.concatenate([first[folded], second[folded]]) // 3)].sum() / area.sum())
 

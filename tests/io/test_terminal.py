@@ -275,3 +275,12 @@ def test_closed_pipe_is_no_error(tmp_path):
             ["bash", "-c", command.format(words)], capture_output=True, text=True, env=environment, check=True
         )
         assert (done.stdout, done.stderr) == ("0\n", "")
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-", ">&- 2>&-"])
+def test_closed_streams_are_no_error(closed):
+    environment = {**os.environ, "PYTHONPATH": os.getcwd()}
+    for words, code in (("--version", 0), ("generate --help", 0), ("no-command", 2)):
+        command = f"{sys.executable} -m gsim3d {words} {closed}; echo $?"
+        done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, env=environment, check=True)
+        assert done.stdout.endswith(f"{code}\n") and "Traceback" not in done.stderr

@@ -13,7 +13,7 @@ from gsim3d.synth.meshes import load_body
 
 CORNERS = [(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)]
 SIDES = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
-INWARDS = [side[::-1] for side in SIDES]
+INWARDS = [side[::-1] for side in SIDES]  # also cut into other triangles
 RED, GREEN, BLUE = (1, 0, 0), (0, 1, 0), (0, 0, 1)
 
 
@@ -256,6 +256,8 @@ REFUSED = {
     "colours out of range": (lambda d: write(d, vertices(0, (-1, 0, 0)) + sides(1)), "vertex colours must be in"),
     "an archive": (lambda d: write(d, "", "body.zip"), "the supported formats are .glb, .gltf, .obj"),
     "COFF": (lambda d: off(d, "COFF", " 255 0 0 255"), "colours, which are not supported in OFF"),
+    "both sides of every face": (lambda d: write(d, vertices() + sides(1) + sides(1, INWARDS)), "or doubled faces"),
+    "a second body on top": (lambda d: write(d, vertices() + sides(1) + vertices() + sides(9, INWARDS)), "or doubled"),
     "a concave polygon": (lambda d: write(d, prism()), "fold back onto others, as of concave polygons"),
     "a texture that repeats": (lambda d: textured(d, "-s 2 2 1 "), "option -s of map_Kd of material 'red'"),
     "a texture that is moved": (lambda d: textured(d, "-blendu on -o 1 0 0 "), "option -o of map_Kd"),
