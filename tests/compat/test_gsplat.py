@@ -295,6 +295,9 @@ def test_means2d_have_gradients(device, packed):
     grad, absolute = meta["means2d"].grad, meta["means2d"].absgrad
     assert grad.shape == absolute.shape == meta["means2d"].shape and grad.abs().max() > 0
     assert (absolute >= grad.abs() - 1e-12).all() and absolute.sum() > 1.1 * grad.abs().sum()
+    color, _, meta = rasterization(**arguments, **SIZE, packed=packed)
+    color.sum().backward()
+    assert not hasattr(meta["means2d"], "absgrad")
 
 
 def test_lists_of_tiles_are_refused_by_name():
