@@ -42,7 +42,7 @@ from gsim3d.io.sequence import open_sequence  # noqa: E402
 from gsim3d.state import Particles  # noqa: E402
 from gsim3d.synth import generate  # noqa: E402
 from gsim3d.train.restore import Restored, restore  # noqa: E402
-from gsim3d.viewer.export import export  # noqa: E402
+from gsim3d.viewer.export import write_frames  # noqa: E402
 from gsim3d.viewer.films import ACCENT, GAP, WHITE, film_frames, write_text, write_time  # noqa: E402
 
 Rows = dict[str, np.ndarray]  # label -> images uint8 [S, V, H, W, 3]
@@ -152,8 +152,8 @@ def orbit(out: Path, posters: Path, frames: int | None) -> None:
     film = out / "orbit.mp4"
     write_gaussians(out / "orbit", restored, prediction, scene.fps)
     film.unlink(missing_ok=True)
-    export(out / "orbit", film, turns=TURNS)
     frames = open_sequence(out / "orbit")
+    write_frames(film, frames, len(frames), fps=frames.fps, turns=TURNS)
     images = np.stack(list(orbit_frames(frames, len(frames), TILE, TURNS)))[:, None]
     poster(posters / "orbit.jpg", {"": images}, scene.fps, 0)
 

@@ -218,7 +218,7 @@ ATTRIBUTES = {
         _kept("light_occlusion", default=-1.0, validated=False),
         _kept("rest_positions", (3,), "point", "means", validated=False),
         _kept("body", (3,), "point", "means", validated=False),
-        _kept("view", (), "index", -1, validated=False, dtype=torch.int64),
+        _kept("label", (), "index", -1, validated=False, dtype=torch.int64),
     )
 }
 
@@ -340,7 +340,7 @@ class Particles(TensorRecord):
             in models with shape matching.
         body: [N, 3] metres, centroid of the visible part of the particle's body at encoding, which identifies the body;
             only in models that segment bodies.
-        view: int64 [N], which image of its cloud an encoded particle came from; only in training that leaves it out.
+        label: int64 [N], a number that the caller gives, as of the view or body that it came from; not read by a step.
         world_offset: float64 [B, 3] metres, translation between the coordinates of each scene's files and those of
             cameras, origin and positions, which keeps the latter small enough for float32; None: 0. Edits and files use
             the coordinates of the scene's files.
@@ -370,7 +370,7 @@ class Particles(TensorRecord):
     light_occlusion: Tensor | None = None
     rest_positions: Tensor | None = None
     body: Tensor | None = None
-    view: Tensor | None = None
+    label: Tensor | None = None
     world_offset: Tensor | None = None
     actions: Actions | None = None
     known: CloudTable | None = None

@@ -13,7 +13,7 @@ SPEC.loader.exec_module(sizes)
 TODAY = {
     "lines of the package": 45_884,
     "lines of the library without io": 15_790,
-    "lines of readers, writers and the viewer": 4_519,
+    "lines of readers, writers and the viewer": 4_515,
 }
 
 

@@ -35,7 +35,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--size", type=whole(16, 4096), default=512, metavar="PX", help="of a video (default 512)")
     turns = "of a video's camera (default 0.25; 1 around a single frame)"
     add("--turns", type=number(-1e3, 1e3), help=turns)
-
     add("--scene", metavar="SCENE", help="recorded scene that TARGET predicts: truth beside it")
     add("--start", type=whole(0), default=0, help="step of SCENE that is shown first (default 0)")
     add("--camera", type=whole(0), default=0, metavar="CAM", help="of SCENE (default 0)")
@@ -43,13 +42,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from gsim3d.errors import InputError
-    from gsim3d.viewer.export import export
+    from gsim3d.io.sequence import open_sequence
+    from gsim3d.io.terminal import progress
+    from gsim3d.viewer.export import FPS, write_frames
     from gsim3d.viewer.targets import open_target
 
     if args.scene is None and (args.start or args.camera):
         raise InputError("--start and --camera belong to --scene")
     if args.scene is None:
-        print(export(**{name: given for name, given in vars(args).items() if name not in ("scene", "start", "camera")}))
+        sequence = open_sequence(args.target, args.up)
+        chosen = range(len(sequence))[slice(None) if args.frame is None else slice(args.frame, args.frame + 1 or None)]
+        if not chosen:
+            raise InputError(f"--frame {args.frame}: {args.target} has {len(sequence)} frames, from 0")
+        frames, fps = (sequence[one] for one in progress(chosen, unit="frame")), args.fps or sequence.fps or FPS
+        print(write_frames(args.to, frames, len(chosen), fps=fps, up=args.up_to, size=args.size, turns=args.turns))
         return 0
     if args.frame is not None or args.up_to or args.turns is not None:
         raise InputError("--frame, --up-to and --turns do not go with --scene: its camera sees every frame")

@@ -21,10 +21,8 @@ def layout_of(folder: str | Path) -> ModuleType:
     """Returns the layout module of a scene folder. Raises InputError if no layout recognises it."""
     found = _find(Path(folder))
     if found is None:
-        lacks = (
-            f"scene folder: it has no {_files()} (see docs/reference/data.md)" if Path(folder).is_dir() else "folder"
-        )
-        raise InputError(f"{folder} is not a {lacks}")
+        lacks = f"scene folder: it has no {_files()} (see docs/reference/data.md)"
+        raise InputError(f"{folder} is not a {lacks if Path(folder).is_dir() else 'folder'}")
     return found
 
 

@@ -2,17 +2,9 @@
 
 import importlib
 
-_HOME = {
-    "FORMATS": "formats",
-    "format_of": "formats",
-    "read_particles": "particles",
-    "read_ply": "ply",
-    "read_splats": "formats",
-    "write_particles": "particles",
-    "write_ply": "ply",
-    "write_splats": "formats",
-    "write_video": "video",
-}
+_HOME = dict.fromkeys(("FORMATS", "format_of", "read_splats", "write_splats"), "formats")
+_HOME |= {"read_ply": "ply", "write_ply": "ply", "write_video": "video"}
+_HOME |= dict.fromkeys(("read_particles", "write_particles"), "particles")
 
 __all__ = list(_HOME)
 

@@ -17,6 +17,7 @@ import json
 import os
 import platform
 import shutil
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -56,10 +57,9 @@ def _is_scale(value: Any) -> bool:
     return isinstance(value, (list, tuple)) and len(value) == 2 and _is_time(value[0]) and _is_count(value[1])
 
 
+_COUNTS = ("step", "next_sample", "n_skipped", "n_skipped_in_a_row")
 _STATE_VALUES = {
-    **dict.fromkeys(
-        ("step", "next_sample", "n_skipped", "n_skipped_in_a_row"), (_is_count, "a whole number of at least 0")
-    ),
+    **dict.fromkeys(_COUNTS, (_is_count, "a whole number of at least 0")),
     "seconds": (_is_time, "a number of at least 0"),
     "loss_scale": (_is_scale, "a number and a count"),
     "scenes": (_are_texts, "names"),
@@ -76,8 +76,8 @@ class Checkpoint:
     config: dict[str, Any]  #: the content of config.yaml: format, model, data, effects, train
     #: step, next_sample, and what else resuming needs; plain JSON values
     state: dict[str, Any] = field(default_factory=dict)
-    ema: dict[str, Tensor] = field(default_factory=dict)  #: tensors by name; ema and optimizer may be empty
-    optimizer: dict[str, Tensor] = field(default_factory=dict)  #: tensors by name; ema and optimizer may be empty
+    ema: dict[str, Tensor] = field(default_factory=dict)  #: tensors by name, or empty
+    optimizer: dict[str, Tensor] = field(default_factory=dict)  #: tensors by name, or empty
     digest: str | None = None  #: hash that names this checkpoint; None before it is written
 
     @property
@@ -102,10 +102,8 @@ def save(run: str | Path, checkpoint: Checkpoint, keep: int = 2) -> Path:
         write(folder, checkpoint)
         _write_text(root / POINTER, folder.name)
     except OSError as error:
-        raise InputError(
-            f"{folder}: cannot be written: {error.strerror}; checkpoints before it are untouched: make room and train "
-            "again, it goes on from the last one"
-        ) from None
+        advice = "checkpoints before it are untouched: make room and train again, it goes on from the last one"
+        raise InputError(f"{folder}: cannot be written: {error.strerror}; {advice}") from None
     for old in sorted(root.glob("step_*"))[:-keep]:
         if old != folder:
             shutil.rmtree(old, ignore_errors=True)
@@ -177,18 +175,13 @@ def _load(path: Path) -> Checkpoint:
         return _load_folder(pointer.parent / Path(read_file(pointer, MAX_TEXT).decode(errors="replace").strip()).name)
     except InputError as error:
         for older in sorted(pointer.parent.glob("step_*"), reverse=True):
-            if _is_whole(older):
+            with suppress(InputError):
+                _load_folder(older)
                 advice = f"{older.name} beside it is whole: write this name into {pointer} to go on from there"
-                raise InputError(f"{error}; {advice}") from None
-        raise
-
-
-def _is_whole(folder: Path) -> bool:
-    try:
-        _load_folder(folder)
-    except InputError:
-        return False
-    return True
+                break
+        else:
+            raise
+        raise InputError(f"{error}; {advice}") from None
 
 
 def _load_folder(path: Path) -> Checkpoint:
@@ -258,11 +251,8 @@ def _bytes_of(tensors: dict[str, Tensor], metadata: dict[str, str] | None = None
     Raises NumericalError where a tensor is not finite.
     """
     if name := _first_not_finite(tensors):
-        raise NumericalError(
-            f"{name}: holds numbers that are not finite; nothing is written: lower the learning rate and go on "
-            "from the last checkpoint",
-            tensor=name,
-        )
+        advice = "nothing is written: lower the learning rate and go on from the last checkpoint"
+        raise NumericalError(f"{name}: holds numbers that are not finite; {advice}", tensor=name)
     return safetensors.torch.save({k: v.detach().cpu().contiguous().clone() for k, v in tensors.items()}, metadata)
 
 

@@ -41,20 +41,15 @@ def write(path: Path, splats: Splats) -> None:
     splats = _sorted(splats)
     n_chunks = -(-splats.count // CHUNK)
     positions, low, high = _between(splats.means, n_chunks)
-    scales, low_scale, high_scale = _between(
-        np.clip(np.log(splats.scales), -LOG_SCALES, LOG_SCALES).astype(np.float32), n_chunks
-    )
+    log_scales = np.clip(np.log(splats.scales), -LOG_SCALES, LOG_SCALES).astype(np.float32)
+    scales, low_scale, high_scale = _between(log_scales, n_chunks)
     colors, low_color, high_color = _between(colors_of(splats).astype(np.float32), n_chunks)
     limits = np.concatenate([low, high, low_scale, high_scale, low_color, high_color], 1).astype("<f4")
-    vertices = np.stack(
-        [
-            _pack(positions),
-            _pack_rotations(splats.quats),
-            _pack(scales),
-            sum(unorm(channel, 8) << shift for channel, shift in zip((*colors.T, splats.opacities), (24, 16, 8, 0))),
-        ],
-        1,
-    ).astype("<u4")
+    rgba = sum(unorm(channel, 8) << shift for channel, shift in zip((*colors.T, splats.opacities), (24, 16, 8, 0)))
+    largest, others = smallest_three(splats.quats)
+    rotations = pack_tens(largest, unorm(others * (0.5 * 2**0.5) + 0.5, 10))
+    packed = (_pack(positions), rotations, _pack(scales), rgba)
+    vertices = np.stack(packed, 1).astype("<u4")
     rest = splats.sh[:, 1:].transpose(0, 2, 1).reshape(splats.count, 3 * (splats.sh.shape[1] - 1))
     levels = np.clip(np.trunc((rest / 8 + 0.5) * 256), 0, 255).astype(np.uint8)
     header = ["ply", "format binary_little_endian 1.0", *[f"comment {MIP}"] * splats.antialiased]
@@ -98,10 +93,11 @@ def read(path: Path) -> Splats:
 
     packed = vertex["packed_color"]
     bytes_of = np.stack([(packed >> shift) & 255 for shift in (24, 16, 8, 0)], 1) / 255.0
+    largest, others = unpack_tens(vertex["packed_rotation"])
     log_scales = between(_unpack(vertex["packed_scale"]), "_scale", "xyz")
     return Splats(
         means=between(_unpack(vertex["packed_position"]), "", "xyz"),
-        quats=_unpack_rotations(vertex["packed_rotation"]),
+        quats=from_smallest_three(largest, (others / 1023.0 - 0.5) * 2**0.5),
         scales=np.exp(np.clip(log_scales, -LOG_SCALES, LOG_SCALES)),
         opacities=bytes_of[:, 3],
         sh=np.concatenate([dc_of(between(bytes_of[:, :3], "", "rgb"))[:, None], _rest(path, tables, count)], 1),
@@ -155,13 +151,3 @@ def _pack(values: np.ndarray) -> np.ndarray:
 
 def _unpack(packed: np.ndarray) -> np.ndarray:
     return np.stack([(packed >> 21) / 2047.0, ((packed >> 11) & 1023) / 1023.0, (packed & 2047) / 2047.0], 1)
-
-
-def _pack_rotations(quats: np.ndarray) -> np.ndarray:
-    largest, others = smallest_three(quats)
-    return pack_tens(largest, unorm(others * (0.5 * 2**0.5) + 0.5, 10))
-
-
-def _unpack_rotations(packed: np.ndarray) -> np.ndarray:
-    largest, fields = unpack_tens(packed)
-    return from_smallest_three(largest, (fields / 1023.0 - 0.5) * 2**0.5)

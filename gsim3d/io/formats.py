@@ -31,18 +31,13 @@ class Format:
     has_time: bool = False  #: whether one file holds a sequence
 
 
+_PACKED = "positions in 11, 10 and 11 bits of a chunk of 256, colours in 8"
+_FIXED = "positions to 0.13 mm, colours in 8 bits; version 3"
 FORMATS = {
-    ".compressed.ply": Format(
-        "positions in 11, 10 and 11 bits of a chunk of 256, colours in 8",
-        compressed_ply.write,
-        compressed_ply.read,
-        says_antialiased=True,
-    ),
+    ".compressed.ply": Format(_PACKED, compressed_ply.write, compressed_ply.read, says_antialiased=True),
     ".ply": Format("3DGS layout, float32", None, None, says_antialiased=True),
     ".splat": Format("float32 positions and scales, colours in 8 bits", splat.write, splat.read, most_degree=0),
-    ".spz": Format(
-        "positions to 0.13 mm, colours in 8 bits; version 3", spz.write, spz.read, up="y", says_antialiased=True
-    ),
+    ".spz": Format(_FIXED, spz.write, spz.read, up="y", says_antialiased=True),
     ".glb": Format("glTF with KHR_gaussian_splatting, float32", gltf.write, gltf.read, up=None),
     ".usdc": Format("USD particle field, float32, with time", usd.write, usd.read, up=None, has_time=True),
     ".usda": Format("USD as text", usd.write, usd.read, up=None, has_time=True),
@@ -92,11 +87,8 @@ def write_splats(
         message = f"{path}: {suffix} does not say that Gaussians are antialiased: small ones will appear too bright"
         warnings.warn(message, FitWarning, stacklevel=2)
     if chosen.has_time:
-        frames = [
-            splats_of(part, index, path)
-            for part in parts
-            for index in (range(len(part.cu_rows) - 1) if frame is None else (frame,))
-        ]
+        chosen_of = ((part, range(len(part.cu_rows) - 1) if frame is None else (frame,)) for part in parts)
+        frames = [splats_of(part, index, path) for part, indices in chosen_of for index in indices]
         if not frames:
             raise InputError(f"{path}: there is no frame to write")
         chosen.write(path, frames, fps)

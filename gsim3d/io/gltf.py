@@ -23,6 +23,8 @@ DEGREES, MAX_NODES = 4, 1000
 
 def write(path: Path, splats: Splats) -> None:
     """Writes ``splats`` without loss; COLOR_0 holds degree 0 for viewers without the extension."""
+    if not splats.count:
+        raise InputError(f"{path}: a glTF accessor needs one Gaussian at least; there is none")
     quats = splats.quats[:, [1, 2, 3, 0]]
     columns = {"POSITION": splats.means, f"{EXTENSION}:ROTATION": quats, f"{EXTENSION}:SCALE": splats.scales}
     columns |= {f"{EXTENSION}:OPACITY": splats.opacities[:, None]}
@@ -38,27 +40,18 @@ def write(path: Path, splats: Splats) -> None:
         kind = "SCALAR" if values.shape[1] == 1 else f"VEC{values.shape[1]}"
         accessor = {"bufferView": len(accessors), "count": splats.count, "type": kind}
         accessor |= {"componentType": FLOAT} if is_float else {"componentType": UBYTE, "normalized": True}
-        if name == "POSITION" and splats.count:
+        if name == "POSITION":
             accessor |= {"min": splats.means.min(0).tolist(), "max": splats.means.max(0).tolist()}
         accessors.append(accessor)
         parts.append(data)
         begin += len(data)
     how = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
     how["sortingMethod"] = "cameraDistance"
-    w, x, y, z = Z_TO_Y_UP
-    document = {
-        "asset": {"version": "2.0", "generator": "gsim3d"},
-        "extensionsUsed": [EXTENSION],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "rotation": [x, y, z, w]}],
-        "meshes": [{"primitives": [{"mode": POINTS, "attributes": attributes, "extensions": {EXTENSION: how}}]}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": begin}],
-    }
-    if not splats.count:
-        raise InputError(f"{path}: a glTF accessor needs one Gaussian at least; there is none")
+    primitive, (w, x, y, z) = {"mode": POINTS, "attributes": attributes, "extensions": {EXTENSION: how}}, Z_TO_Y_UP
+    document = {"asset": {"version": "2.0", "generator": "gsim3d"}, "extensionsUsed": [EXTENSION], "scene": 0}
+    document |= {"scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0, "rotation": [x, y, z, w]}]}
+    document |= {"meshes": [{"primitives": [primitive]}], "accessors": accessors, "bufferViews": views}
+    document["buffers"] = [{"byteLength": begin}]
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     data = b"".join(parts) + b"\0" * (-begin % 4)

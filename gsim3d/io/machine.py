@@ -19,12 +19,8 @@ def machine(device: torch.device) -> dict[str, str]:
     """Versions, device and processor of a measurement. "sources" is a hash of the package's Python files."""
     import torch  # not above: workers that generate data run without torch
 
-    found = {
-        "gsim3d": gsim3d.__version__,
-        "sources": _hash_of_sources(),
-        "torch": torch.__version__,
-        "python": platform.python_version(),
-    }
+    found = {"gsim3d": gsim3d.__version__, "sources": _hash_of_sources()}
+    found |= {"torch": torch.__version__, "python": platform.python_version()}
     if device.type == "cuda":
         return found | {"device": torch.cuda.get_device_name(device), "cuda": str(torch.version.cuda)}
     return found | {"device": f"CPU, {torch.get_num_threads()} threads", "processor": processor_name()}
@@ -32,10 +28,8 @@ def machine(device: torch.device) -> dict[str, str]:
 
 def processor_name() -> str:
     """Model name of the CPU, or its architecture if the system does not give one."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.is_file() else []
     names = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
     return next(names, platform.processor() or platform.machine())
 

@@ -37,26 +37,12 @@ def camera_around(gaussians: Gaussians, azimuth: float, size: int) -> Cameras:
 @torch.no_grad()
 def picture(gaussians: Gaussians, camera: Cameras, background: torch.Tensor | None = None) -> np.ndarray:
     """One image uint8 [H, W, 3]."""
-    image = rasterize_gaussians(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        _opacities(gaussians, camera),
-        camera,
-        sh=gaussians.sh,
-        background=background,
-        near_plane=min(NEAR, 0.1 * float(camera.near[0])),
-        on_invalid="drop",
-    ).color[0]
+    fields, opacities = (gaussians.means, gaussians.quats, gaussians.scales), gaussians.opacities
+    if gaussians.antialiased:
+        opacities = opacities * project_gaussians(*fields, camera, antialiased=True).compensations
+    options = {"near_plane": min(NEAR, 0.1 * float(camera.near[0])), "on_invalid": "drop", "background": background}
+    image = rasterize_gaussians(*fields, opacities, camera, sh=gaussians.sh, **options).color[0]
     return (image.clamp(0, 1) * 255).round().byte().numpy()
-
-
-def _opacities(gaussians: Gaussians, camera: Cameras) -> torch.Tensor:
-    """[N], times the compensation where the Gaussians are antialiased."""
-    if not gaussians.antialiased:
-        return gaussians.opacities
-    fields = (gaussians.means, gaussians.quats, gaussians.scales)
-    return gaussians.opacities * project_gaussians(*fields, camera, antialiased=True).compensations
 
 
 def _reach(gaussians: Gaussians) -> tuple[torch.Tensor, float]:

@@ -41,18 +41,12 @@ def write_ply(path: str | Path, gaussians: Gaussians, cloud: int | None = None) 
     if not np.isfinite(positions).all():
         raise InputError(f"{path}: cannot write Gaussians, world_offset holds values that are not finite")
     opacities = torch.from_numpy(splats.opacities).double().clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
-    numbers = np.concatenate(
-        [
-            np.zeros_like(splats.means),
-            splats.sh[:, 0],
-            splats.sh[:, 1:].transpose(0, 2, 1).reshape(splats.count, 3 * (splats.sh.shape[1] - 1)),
-            torch.logit(opacities).float().numpy()[:, None],
-            torch.from_numpy(splats.scales).log().numpy(),
-            splats.quats,
-        ],
-        1,
-    )
-    names = _property_names(splats.sh.shape[1] - 1)
+    n_rest = 3 * (splats.sh.shape[1] - 1)
+    rest = splats.sh[:, 1:].transpose(0, 2, 1).reshape(splats.count, n_rest)
+    logits, logs = torch.logit(opacities).float().numpy()[:, None], torch.from_numpy(splats.scales).log().numpy()
+    numbers = np.concatenate([np.zeros_like(splats.means), splats.sh[:, 0], rest, logits, logs, splats.quats], 1)
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(n_rest))]
+    names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
     kinds = ["double" if positions.dtype == np.float64 else "float"] * 3 + ["float"] * (len(names) - 3)
     table = np.empty(splats.count, [(name, "<f8" if kind == "double" else "<f4") for name, kind in zip(names, kinds)])
     for i, name in enumerate(names):
@@ -97,10 +91,8 @@ def _is_mip(path: Path, header: Header) -> bool:
     """Whether Gaussians were trained with Mip-Splatting's compensation. Raises InputError for a compressed file."""
     names = {name for element in header.elements for name, _, _ in element.properties}
     if packed := sorted(name for name in names if name.startswith("packed_")):
-        raise InputError(
-            f"{path}: a compressed .ply (it has {packed[0]}); write it uncompressed first, for example with "
-            "splat-transform"
-        )
+        wanted = "write it uncompressed first, for example with splat-transform"
+        raise InputError(f"{path}: a compressed .ply (it has {packed[0]}); {wanted}")
     return "filter_3D" in names or header.is_mip
 
 
@@ -112,31 +104,20 @@ def _gaussians(path: Path, table: dict[str, np.ndarray]) -> Gaussians:
         return torch.stack([torch.from_numpy(table[name].astype(np.float32)) for name in names], 1)
 
     means, offset = _positions(path, stack, table)
-    scales = torch.exp(stack(["scale_0", "scale_1"] if _is_flat(table) else ["scale_0", "scale_1", "scale_2"]))
-    if _is_flat(table):
+    is_flat = "scale_1" in table and "scale_2" not in table  # Gaussians of 2DGS
+    scales = torch.exp(stack(["scale_0", "scale_1"] if is_flat else ["scale_0", "scale_1", "scale_2"]))
+    if is_flat:
         scales = torch.cat([scales, torch.full_like(scales[:, :1], SMALLEST_SCALE)], 1)
     opacities = torch.sigmoid(stack(["opacity"])[:, 0])
     if "filter_3D" in table:  # a 3D Gaussian of that standard deviation, with which these are convolved
         own, scales = scales, torch.hypot(scales, stack(["filter_3D"]))
         opacities = opacities * (own / scales.clamp_min(SMALLEST_SCALE)).prod(1)
-    gaussians = Gaussians(
-        means=means,
-        quats=unit_quats(stack(["rot_0", "rot_1", "rot_2", "rot_3"])),
-        scales=scales,
-        opacities=opacities,
-        sh=_colors(path, stack, table).contiguous(),
-        cu_rows=torch.tensor([0, means.shape[0]]),
-        world_offset=offset,
-    )
+    quats, sh = unit_quats(stack(["rot_0", "rot_1", "rot_2", "rot_3"])), _colors(path, stack, table).contiguous()
+    gaussians = Gaussians(means, quats, scales, opacities, sh, torch.tensor([0, len(means)]), offset)
     for name in FIELDS:
         if not torch.isfinite(getattr(gaussians, name)).all():
             raise InputError(f"{path}: {name} holds values that are not finite")
     return gaussians
-
-
-def _is_flat(table: dict[str, np.ndarray]) -> bool:
-    """Whether these are Gaussians of 2DGS."""
-    return "scale_1" in table and "scale_2" not in table
 
 
 def _positions(path: Path, stack, table: dict[str, np.ndarray]) -> tuple[Tensor, Tensor | None]:
@@ -178,11 +159,3 @@ def _of_bytes(path: Path, table: dict[str, np.ndarray], names: tuple[str, ...]) 
         raise InputError(f"{path}: {', '.join(names)} must be {wanted}; got {rgb.dtype} up to {most:g}")
     colors = rgb.astype(np.float32) / np.float32(largest)
     return torch.from_numpy(dc_of(colors))
-
-
-def _property_names(n_rest_per_colour: int) -> list[str]:
-    return (
-        ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
-        + [f"f_rest_{i}" for i in range(3 * n_rest_per_colour)]
-        + ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-    )

@@ -94,16 +94,13 @@ def read_columns(path: Path, content: bytes, header: Header, *names: str) -> dic
         if element.name in wanted and (not properties or len(set(properties)) != len(properties)):
             raise InputError(f"{path}: the header has no usable element {element.name[:80]}")
         if element.count > MAX_LIST_ROWS and any(length for _, length, _ in element.properties):
-            raise InputError(
-                f"{path}: {element.count} rows of element {element.name[:80]} have lists; at most {MAX_LIST_ROWS} such "
-                "rows are read"
-            )
+            most = f"at most {MAX_LIST_ROWS} such rows are read"
+            raise InputError(f"{path}: {element.count} rows of element {element.name[:80]} have lists; {most}")
         try:
             found[element.name] = _columns(body, element)
         except _Truncated:
-            raise InputError(
-                f"{path}: truncated or not numeric: expected {element.count} rows of element {element.name[:80]}"
-            ) from None
+            wanted = f"expected {element.count} rows of element {element.name[:80]}"
+            raise InputError(f"{path}: truncated or not numeric: {wanted}") from None
     return found
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import types
 import typing
+from contextlib import suppress
 from typing import Any, TypeVar
 
 from gsim3d.errors import InputError, did_you_mean
@@ -123,16 +124,12 @@ def _convert(hint: Any, value: Any, where: str, base: Any) -> Any:
         return tuple(_convert(kind, item, f"{where}[{i}]", None) for i, (kind, item) in enumerate(zip(kinds, value)))
     if origin is typing.Literal:
         if value not in arguments:
-            raise InputError(
-                f"{where}: must be one of {', '.join(map(repr, arguments))}; got {shown(value)}"
-                f"{did_you_mean(value, map(str, arguments))}"
-            )
+            known, hint = ", ".join(map(repr, arguments)), did_you_mean(value, map(str, arguments))
+            raise InputError(f"{where}: must be one of {known}; got {shown(value)}{hint}")
         return value
     if hint is float and isinstance(value, str):  # YAML 1.1 reads 2e-4 as text
-        try:
+        with suppress(ValueError):
             value = float(value)
-        except ValueError:
-            pass
     plain = {bool: "true or false", int: "a whole number", float: "a number", str: "text", dict: "a mapping"}
     if hint in plain or origin is dict:
         kind = hint if hint in plain else dict

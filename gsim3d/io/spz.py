@@ -36,7 +36,10 @@ def write(path: Path, splats: Splats) -> None:
     alphas = np.round(255 * splats.opacities.astype(np.float64)).astype(np.uint8)
     colors = np.clip(np.round(splats.sh[:, 0] * (COLOR_SCALE * 255) + 127.5), 0, 255).astype(np.uint8)
     scales = np.clip(np.round((np.log(splats.scales.astype(np.float64)) + 10) * 16), 0, 255).astype(np.uint8)
-    parts = [positions, alphas, colors, scales, _pack_rotations(splats.quats), _pack_harmonics(splats.sh[:, 1:])]
+    levels = np.round(splats.sh[:, 1:] * 128.0).astype(np.int64) + 128
+    bucket = np.where(np.arange(levels.shape[1]) < 3, 8, 16)[None, :, None]  # of degree 1, of others
+    rest = np.clip((levels + bucket // 2) // bucket * bucket, 0, 255).astype(np.uint8)
+    parts = [positions, alphas, colors, scales, _pack_rotations(splats.quats), rest]
     header = HEADER.pack(MAGIC, 3, splats.count, splats.degree, bits, ANTIALIASED * splats.antialiased, 0)
     body = header + b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
     write_whole(path, gzip.compress(body, mtime=0))
@@ -98,9 +101,8 @@ def _read_streams(path: Path, content: bytes) -> Splats:
         except zstandard.ZstdError as error:
             raise InputError(f"{path}: stream {index} is damaged: {error}") from None
         if len(part) != size:
-            raise InputError(
-                f"{path}: stream {index} holds {'more' if len(part) > size else 'fewer'} than {size} bytes"
-            )
+            amount = "more" if len(part) > size else "fewer"
+            raise InputError(f"{path}: stream {index} holds {amount} than {size} bytes")
         parts.append(part)
         begin += packed
     return _decoded(version, count, degree, bits, is_mip, parts + [b""] * (6 - n_streams))
@@ -125,18 +127,15 @@ def _decoded(version: int, count: int, degree: int, bits: int, is_mip: bool, par
     fixed[:, :, :3] = positions.reshape(count, 3, 3)
     fixed[:, :, 3] = np.where(fixed[:, :, 2] & 128, 255, 0)
     means = fixed.view("<i4")[..., 0] / 2.0**bits
-    quats = _unpack_three(rotations, count) if version == 2 else _unpack_rotations(rotations)
+    if version == 2:
+        xyz = rotations.reshape(count, 3) / 127.5 - 1
+        quats = np.concatenate([np.sqrt(np.clip(1 - (xyz**2).sum(1, keepdims=True), 0, 1)), xyz], 1)
+    else:
+        quats = _unpack_rotations(rotations)
     dc = (colors.reshape(count, 3) / 255.0 - 0.5) / COLOR_SCALE
     harmonics = (rest.reshape(count, N_REST[degree], 3) - 128.0) / 128
     sh = np.concatenate([dc[:, None], harmonics], 1)
     return Splats(means, quats, np.exp(scales.reshape(count, 3) / 16.0 - 10), alphas / 255.0, sh, is_mip)
-
-
-def _pack_harmonics(rest: np.ndarray) -> np.ndarray:
-    """uint8 [N, K, 3], in buckets of 8 (degree 1) or 16 levels."""
-    levels = np.round(rest * 128.0).astype(np.int64) + 128
-    bucket = np.where(np.arange(rest.shape[1]) < 3, 8, 16)[None, :, None]
-    return np.clip((levels + bucket // 2) // bucket * bucket, 0, 255).astype(np.uint8)
 
 
 def _pack_rotations(quats: np.ndarray) -> np.ndarray:
@@ -150,9 +149,3 @@ def _unpack_rotations(rotations: np.ndarray) -> np.ndarray:
     largest, fields = unpack_tens(np.ascontiguousarray(rotations).view("<u4"))
     sizes = (fields & 511) / 511.0 / 2**0.5
     return from_smallest_three(largest, np.where(fields >> 9, -sizes, sizes))[:, [3, 0, 1, 2]]
-
-
-def _unpack_three(rotations: np.ndarray, count: int) -> np.ndarray:
-    xyz = rotations.reshape(count, 3) / 127.5 - 1
-    w = np.sqrt(np.clip(1 - (xyz**2).sum(1), 0, 1))
-    return np.concatenate([w[:, None], xyz], 1)

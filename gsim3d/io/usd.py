@@ -64,7 +64,9 @@ def read(path: Path) -> Splats:
     _pxr(path)  # is installed
     with TemporaryDirectory() as place:
         out = Path(place) / "arrays.npz"
-        if status := _child(str(path), str(out)):
+        few = dict.fromkeys(("PXR_WORK_THREAD_LIMIT", "OPENBLAS_NUM_THREADS", "MALLOC_ARENA_MAX"), "1")  # address space
+        command = [sys.executable, "-P", usd_child.__file__, str(path), str(out)]
+        if status := subprocess.run(command, env={**os.environ, **few}, capture_output=True).returncode:
             ended = signal.Signals(-status).name if status < 0 else f"code {status}"
             raise InputError(f"{path}: damaged, or too large: OpenUSD was ended by {ended} while reading it")
         with np.load(out) as file:
@@ -80,13 +82,6 @@ def read(path: Path) -> Splats:
     parts = [placed(Splats(*part), place, path) for *part, place in zip(*columns, found["places"])]
     whole = placed(joined(parts, path), np.diag([unit, unit, unit, 1.0]), path)
     return turned(whole, Y_TO_Z_UP) if found["is_y_up"] else whole
-
-
-def _child(file: str, out: str) -> int:
-    """Runs ``usd_child``; its exit status."""
-    few = dict.fromkeys(("PXR_WORK_THREAD_LIMIT", "OPENBLAS_NUM_THREADS", "MALLOC_ARENA_MAX"), "1")  # address space
-    command = [sys.executable, "-P", usd_child.__file__, file, out]
-    return subprocess.run(command, env={**os.environ, **few}, capture_output=True).returncode
 
 
 def _spans(frames: Sequence[Splats]) -> Iterator[tuple[int, list[Splats]]]:

@@ -13,10 +13,10 @@ from gsim3d.state import Particles
 
 def with_views(particles: Particles, frames: Frames, shapes: StaticShapes | None = None) -> Particles:
     """Returns particles, encoded from ``frames`` with equally many images in every cloud, sorted by cloud, with their
-    ``view``. ``shapes`` as of :meth:`gsim3d.Simulator.encode`."""
+    view as ``label``. ``shapes`` as of :meth:`gsim3d.Simulator.encode`."""
     image = torch.arange(len(frames.cameras), device=particles.means.device) % images_per_cloud(frames)
     view = pixel_rows(frames, image[:, None, None].expand(-1, *frames.images.shape[2:]), shapes)
-    return dataclasses.replace(particles, view=view)
+    return dataclasses.replace(particles, label=view)
 
 
 def images_per_cloud(frames: Frames) -> int:
@@ -31,7 +31,7 @@ def draw_left_out(
 
     Args:
         draw: function (particles, cameras, valid) -> images [I, H, W, 3].
-        particles: particles with ``view``; those of left-out views have opacity 0.
+        particles: particles with their view as ``label``; those of left-out views have opacity 0.
         targets: frames of I cameras, ``n_views`` for each cloud, in the order of the input images.
         n_views: input images of each cloud.
 
@@ -44,7 +44,7 @@ def draw_left_out(
     images, cameras, valid = [], targets.cameras, targets.valid
     number = torch.arange(len(cameras), device=particles.means.device).view(-1, n_views)
     for view in range(n_views):
-        opacities = particles.opacities.masked_fill(particles.view == view, 0)
+        opacities = particles.opacities.masked_fill(particles.label == view, 0)
         others = dataclasses.replace(particles, opacities=opacities)
         chosen = number[:, view]
         images.append(draw(others, cameras.select(chosen), None if valid is None else valid[chosen]))

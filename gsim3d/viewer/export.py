@@ -10,48 +10,12 @@ from gsim3d.io import write_video
 from gsim3d.io.files import new_output_path, with_parents
 from gsim3d.io.formats import format_of, write_splats
 from gsim3d.io.orbit import orbit_frames
-from gsim3d.io.sequence import open_sequence
-from gsim3d.io.terminal import progress
 from gsim3d.state import Gaussians
 from gsim3d.viewer.films import write_time
 from gsim3d.viewer.player import write_player
 
 FPS = 24.0
 ORBIT = 6.0  # seconds of a video of a single frame
-
-
-def export(
-    target: str | Path,
-    to: str | Path,
-    *,
-    frame: int | None = None,
-    fps: float | None = None,
-    up: str | None = None,
-    up_to: str | None = None,
-    size: int = 512,
-    turns: float | None = None,
-) -> str:
-    """Writes the file ``to``, whose suffix is its format; returns one line about what was written.
-
-    Args:
-        target: a file of Gaussians, a folder with one a frame, or what ``gsim3d simulate`` wrote.
-        frame: one frame, negative: from the end; None: all.
-        fps: frames per second; None: those of ``target``, else 24.
-        up: "y" or "z", the axis that points up in ``target``; None: as its format says.
-        up_to: the same in ``to``.
-        size: pixels, width and height of a video.
-        turns: turns of a video's camera around the scene; None: a quarter, one around a single frame.
-    Raises:
-        InputError: ``target`` cannot be read, or ``to`` cannot hold it.
-    """
-    sequence = open_sequence(target, up)
-    chosen = range(len(sequence))
-    if frame is not None:
-        if not -len(sequence) <= frame < len(sequence):
-            raise InputError(f"--frame {frame}: {target} has {len(sequence)} frames, from 0")
-        chosen = [frame % len(sequence)]
-    frames = (sequence[index] for index in progress(chosen, unit="frame"))
-    return write_frames(to, frames, len(chosen), fps=fps or sequence.fps or FPS, up=up_to, size=size, turns=turns)
 
 
 def write_frames(
@@ -64,7 +28,17 @@ def write_frames(
     size: int = 512,
     turns: float | None = None,
 ) -> str:
-    """Writes ``count`` frames as the file ``to``, as :func:`export` does, with its arguments and errors."""
+    """Writes the file ``to``, whose suffix is its format; returns one line about what was written.
+
+    Args:
+        frames: ``count`` single frames.
+        fps: frames a second.
+        up: "y" or "z", the axis that points up in ``to``; None: as its format says.
+        size: pixels, width and height of a video.
+        turns: turns of a video's camera around the scene; None: a quarter, one around a single frame.
+    Raises:
+        InputError: ``to`` cannot hold it.
+    """
     out = with_parents(new_output_path(to, "file", "--to"))
     if (suffix := out.suffix.lower()) == ".mp4":
         if size % 2:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.data import Scene
-from gsim3d.errors import FitWarning, InputError, did_you_mean
+from gsim3d.errors import FitWarning, InputError, check_one_of
 from gsim3d.io.arrays import colors_of, dc_of, rows_of, splats_of
 from gsim3d.io.files import new_output_path, with_parents
 from gsim3d.io.orbit import picture
@@ -107,11 +108,7 @@ class Layers:
     size: float = 1.0  #: of the drawn Gaussians, relative to their own: small ones show single particles
 
     def __post_init__(self):
-        if self.coloring not in COLORINGS:
-            known = ", ".join(COLORINGS)
-            raise InputError(
-                f"coloring must be one of {known}; got {self.coloring!r}{did_you_mean(self.coloring, COLORINGS)}"
-            )
+        check_one_of("coloring", self.coloring, COLORINGS)
         if not SIZES[0] <= self.size <= SIZES[1]:
             raise InputError(f"size must be from {SIZES[0]:g} to {SIZES[1]:g}; got {self.size}")
 
@@ -120,7 +117,6 @@ class Layers:
 class View:
     """A camera and what it recorded."""
 
-    name: str  #: of the camera
     quat: np.ndarray  #: [4] (w, x, y, z), from the camera's axes (x right, y down, z forward) to those of the scene
     position: np.ndarray  #: [3] metres
     fov: float  #: vertical angle, radians
@@ -187,10 +183,10 @@ class Target:
     @property
     def colorings(self) -> tuple[str, ...]:
         """Those of COLORINGS that the target has values for."""
-        known = {"appearance": True, "velocity": self.n_frames > 1 and self.gaussians(0) is not None}
         latents = bool(self.particles) and self.particles[0].dynamic_latents.shape[1] > 0
-        known |= {"activity": bool(self.particles), "latents": latents, "trust": self._bounds is not None}
-        return tuple(name for name in COLORINGS if known[name])
+        moves = self.n_frames > 1 and self.gaussians(0) is not None
+        known = (True, moves, bool(self.particles), latents, self._bounds is not None)
+        return tuple(name for name, is_known in zip(COLORINGS, known, strict=True) if is_known)
 
     def displacements(self, frame: int) -> Tensor:
         """[N, 3] metres since the frame before; 0 where its particles are others."""
@@ -286,13 +282,13 @@ class Target:
         cameras = scene.cameras_at(cams, [step])
         images = self._truth(frame, cams)
         found = []
-        for i, cam in enumerate(cams):
-            to_world = torch.linalg.inv(cameras.viewmats[i].double())
-            quat = rotation_to_quat(to_world[None, :3, :3])[0].numpy()
-            fov = 2 * np.arctan(cameras.height / 2 / float(cameras.Ks[i, 1, 1]))
-            aspect = cameras.width / cameras.height * float(cameras.Ks[i, 1, 1] / cameras.Ks[i, 0, 0])
+        for i in range(len(cams)):
+            to_world, K = torch.linalg.inv(cameras.viewmats[i].double()), cameras.Ks[i].tolist()
+            quat, position = rotation_to_quat(to_world[None, :3, :3])[0].numpy(), to_world[:3, 3].numpy()
+            fov, aspect = 2 * math.atan(cameras.height / 2 / K[1][1]), cameras.width / cameras.height
+            aspect *= K[1][1] / K[0][0]
             image = None if images is None else images[i]
-            found.append(View(str(scene.camera_names[cam]), quat, to_world[:3, 3].numpy(), float(fov), aspect, image))
+            found.append(View(quat, position, fov, aspect, image))
         return found
 
     def _truth(self, frame: int, cams: Sequence[int]) -> np.ndarray | None:

@@ -90,8 +90,7 @@ def write_player(
     header["truth"] = _encoded(path, truth) if truth is not None else []
     blob = '<script type="text/plain" id="blob{}">{}</script>\n'
     scripts = "".join(blob.format(index, base64.b64encode(one).decode()) for index, one in enumerate(blobs))
-    page = files("gsim3d.viewer").joinpath("player.html").read_text()
-    script = files("gsim3d.viewer").joinpath("player.js").read_text()
+    page, script = (files("gsim3d.viewer").joinpath(f"player.{kind}").read_text() for kind in ("html", "js"))
     filled = page.replace("{{title}}", html.escape(title, quote=False)).replace("{{script}}", script)
     filled = filled.replace("{{blobs}}", scripts).replace("{{poster}}", _jpeg(_poster(first, view, background)))
     write_whole(path, filled.replace("{{header}}", json.dumps(header).replace("<", "\\u003c")))

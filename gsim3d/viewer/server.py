@@ -5,17 +5,21 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import io
+import queue
 import socket
 import threading
 import time
+import traceback
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from gsim3d.effects.edits import Operation
+from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError, NumericalError
 from gsim3d.state import Gaussians, Particles
 from gsim3d.viewer.live import SIZES, SPEEDS, Layers, Target, Timeline, splatting_of, unit_of
@@ -58,9 +62,7 @@ class Viewer:
         server: of viser.
     """
 
-    def __init__(
-        self, target: Target, simulation: Simulation | None = None, *, host: str = LOCAL, port: int = 0
-    ) -> None:
+    def __init__(self, target: Target, simulation: Simulation | None = None, *, host: str = LOCAL, port: int = 0):
         """Serves at ``host``; ``simulation`` made the target and simulates on. Port 0 is a free one.
 
         Raises:
@@ -70,20 +72,21 @@ class Viewer:
         self._target, self._simulation, self._lock = target, simulation, threading.RLock()
         self.timeline, self.layers = Timeline(target.n_frames, target.fps), Layers()
         self.timeline.seek(max(0, target.n_encoded - 1) if simulation else 0)  # the first that can be simulated on
-        scene = target.scene
-        n_cams = 0 if scene is None else scene.n_cams
+        n_cams = 0 if target.scene is None else target.scene.n_cams
         self._cams = sorted({i * n_cams // MOST_CAMERAS for i in range(MOST_CAMERAS)}) if n_cams else []
         self._unit = 1.0 if (first := target.gaussians(0)) is None else unit_of(first)
         self._splats, self._frusta, self._closed = None, {}, threading.Event()
-        self._note, self._next = "", deque(maxlen=1)
+        self._note, self._next, self._is_stale = "", deque(maxlen=1), False
+        self._work, self._n_working = queue.SimpleQueue(), 0
         with contextlib.redirect_stdout(io.StringIO()):  # its banner
             self.server = viser.ViserServer(host, free_port(host, port), label=f"gsim3d: {target.name}", verbose=False)
         self.address = f"http://{LOCAL if host == PUBLIC else host}:{self.server.get_port()}"
         self._look_at_target()
         self._add_controls()
         self.draw()
-        self._clock = threading.Thread(target=self._run, daemon=True)
-        self._clock.start()
+        self._threads = [threading.Thread(target=run, daemon=True) for run in (self._run, self._run_work)]
+        for thread in self._threads:
+            thread.start()
 
     def __enter__(self) -> Viewer:
         return self
@@ -92,10 +95,12 @@ class Viewer:
         self.close()
 
     def close(self) -> None:
-        """Stops the server; its port is free again."""
+        """Stops the server; its port is free again. What is being simulated is waited for, and shown no more."""
         self._closed.set()
-        self._clock.join()
-        with self._lock, contextlib.redirect_stdout(io.StringIO()):
+        self._work.put((None, None))
+        for thread in self._threads:
+            thread.join()
+        with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 
     def wait(self) -> None:
@@ -108,18 +113,48 @@ class Viewer:
         self._next.append((particles, frames, note))
 
     def _run(self) -> None:
+        """Draws, where time passes or a user changed something."""
         before = time.monotonic()
         while not self._closed.wait(TICK):
-            with self._lock:
+            with self._lock, self._telling(*self.server.get_clients().values()):
                 if self._next:
                     particles, frames, self._note = self._next.pop()
                     self._target.replace(particles, frames)
                     self._frames_changed()
-                now = time.monotonic()
-                if self.timeline.advance(now - before):
-                    self.draw()
-                    now = time.monotonic() if not self.timeline.playing else now
-                before = now
+                passed, before = time.monotonic() - before, time.monotonic()
+                if self.timeline.advance(passed) or self._is_stale:
+                    self._is_stale = False
+                    try:
+                        self.draw()
+                    except Exception:
+                        self._pause()
+                        raise
+                    before = before if self.timeline.playing else time.monotonic()
+
+    def _run_work(self) -> None:
+        """Does what takes long, in the order in which users asked for it."""
+        while not self._closed.is_set():
+            work, client = self._work.get()
+            if work is None:
+                return
+            with self._telling(client):
+                if said := work():
+                    client.add_notification("Written", said, color="green")
+            with self._lock:
+                self._n_working, self._is_stale = self._n_working - 1, True
+
+    @contextlib.contextmanager
+    def _telling(self, *clients: Any) -> Iterator[None]:
+        """Shows an error within it to ``clients``."""
+        try:
+            yield
+        except Exception as error:
+            is_known = isinstance(error, (InputError, NumericalError, OSError))
+            said = str(error) if is_known else f"{type(error).__name__}: {error}"
+            for client in clients:
+                client.add_notification("Not possible", said, color="red")
+            if not is_known:
+                traceback.print_exc()
 
     def _look_at_target(self) -> None:
         """Where a browser begins: above and behind the first camera, or all Gaussians from the side."""
@@ -139,7 +174,7 @@ class Viewer:
             reach = max(float(np.quantile(ends, 0.95)), 1e-3)
             camera.position, camera.look_at = middle + reach * np.array([1.8, 1.0, 0.9]), middle
 
-    # Controls. A callback runs in a thread of viser's; the lock lets one of them at a time change what is drawn.
+    # Controls. Callbacks run in the thread that receives messages, in their order; the lock is held to change anything.
 
     def _add_controls(self) -> None:
         gui, target, n = self.server.gui, self._target, self.timeline.n_frames
@@ -169,7 +204,7 @@ class Viewer:
             with gui.add_folder("Truth | prediction" if target.gaussians(0) is not None else "Recorded"):
                 self._camera = gui.add_dropdown("Camera", names)
                 self._beside = gui.add_image(np.zeros((16, 16, 3), np.uint8), format="png")
-            self.on(self._camera, self.draw)
+            self.on(self._camera, lambda: None)
         if target.gaussians(0) is not None:
             with gui.add_folder("Export", expand_by_default=False):
                 path = gui.add_text("File", "seen.ply", hint=EXPORT)
@@ -179,11 +214,14 @@ class Viewer:
         if self._simulation is not None:
             self._panel = SimulationPanel(self, self._simulation)
 
-    def simulate_on(self, n_steps: int, operations: list) -> None:
-        """Predicts the frames after the one that is shown anew, as :meth:`Simulation.simulate_on` does."""
+    def simulate_on(self, frame: int, n_steps: int, more: Operation | None, effects: EffectsSpec) -> None:
+        """Predicts the frames after ``frame`` anew, with its edits and ``more`` (None: without) and ``effects``."""
+        simulation = self._simulation
+        part = simulation.predicted(frame, n_steps, simulation.operations(frame, more), effects)
+        if self.layers.coloring == "trust":
+            simulation.spread(part)
         with self._lock:
-            self.timeline.pause()
-            self._simulation.simulate_on(self.timeline.frame, n_steps, operations)
+            simulation.take(part)
             self._frames_changed()
 
     def _frames_changed(self) -> None:
@@ -193,41 +231,55 @@ class Viewer:
         if self._coloring.options != self._target.colorings:
             self._coloring.options = self._target.colorings
             self.layers = dataclasses.replace(self.layers, coloring=self._coloring.value)
-        self.draw()
+        if self._simulation is not None:
+            self._panel.frame_shown(self.timeline.frame, is_new=True)
+        self._is_stale = True
 
     def on(self, handle: Any, act: Callable[..., Any], event: str = "on_update") -> None:
-        """Calls ``act`` when a user changes ``handle``, or with the click in a scene; its error is shown there."""
+        """Calls ``act`` when a user changes ``handle``, or with the click in a scene; its error is shown there.
 
-        def call(change: Any) -> None:
-            if change.client is None:  # changed by this class
+        ``act`` returns None, or what takes long: it is called later, after what was asked for before.
+        """
+
+        async def call(change: Any) -> None:
+            if change.client is None or self._closed.is_set():  # changed by this class
                 return
-            with self._lock:
-                if self._closed.is_set():
-                    return
-                try:
-                    act(change) if handle is self.server.scene else act()
-                except (InputError, NumericalError, OSError) as error:
-                    change.client.add_notification("Not possible", str(error), color="red")
+            with self._lock, self._telling(change.client):
+                work = act(change) if handle is self.server.scene else act()
+                if work is not None:
+                    self._n_working += 1
+                    self._work.put((work, change.client))
+                self._is_stale = True
 
         register = getattr(handle, event)
         (register() if handle is self.server.scene else register)(call)
 
     def _toggle(self) -> None:
-        (self.timeline.pause if self.timeline.playing else self.timeline.play)()
-        self.draw()
+        (self._pause if self.timeline.playing else self.timeline.play)()
+
+    def _pause(self) -> None:
+        self.timeline.pause()
+        self._play.label = "Play"
 
     def _seek(self, frame: int) -> None:
         self.timeline.pause()
         self.timeline.seek(frame)
-        self.draw()
 
-    def _change_layer(self, name: str, handle: Any) -> None:
+    def _change_layer(self, name: str, handle: Any) -> Callable[[], None] | None:
+        if handle.value == "trust":
+            return partial(self._show_trust, handle)
         self.layers = dataclasses.replace(self.layers, **{name: handle.value})
-        self.draw()
+        return None
 
-    def _export(self, path: str, is_whole: bool) -> None:
+    def _show_trust(self, handle: Any) -> None:
+        for part in self._simulation.parts:
+            self._simulation.spread(part)
+        with self._lock:
+            self.layers = dataclasses.replace(self.layers, coloring=handle.value)
+
+    def _export(self, path: str, is_whole: bool) -> Callable[[], str]:
         frames = range(self._target.n_frames) if is_whole else [self.timeline.frame]
-        self._status.content = f"Written: {self._target.export(Path(path).expanduser(), frames, self.layers)}"
+        return partial(self._target.export, Path(path).expanduser(), frames, self.layers)
 
     # Drawing
 
@@ -258,7 +310,7 @@ class Viewer:
         text += f", {count:,} Gaussians" if count else ""
         if self._simulation is not None:
             text += f", {1000 * self._simulation.seconds_a_step:.0f} ms a simulated step"
-        return text
+        return f"{text}, **at work ({self._n_working} to do)**" if self._n_working else text
 
     def _draw_splats(self, *arrays: np.ndarray) -> None:
         if self._splats is None:

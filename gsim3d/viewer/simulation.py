@@ -18,10 +18,9 @@ from gsim3d.effects.spec import BACKGROUNDS, CHANGING, POLICIES, EffectsSpec, Ou
 from gsim3d.errors import InputError
 from gsim3d.numerics.speed import encode, encode_histories
 from gsim3d.numerics.trust import rollout_with_spread
-from gsim3d.priors.movable import Movable
-from gsim3d.priors.segmentation import SegmentationConfig, segment_bodies
-from gsim3d.state import DYNAMIC, FROZEN, Gaussians, Particles
+from gsim3d.state import DYNAMIC, Gaussians, Particles
 from gsim3d.train.restore import Restored
+from gsim3d.viewer.bodies import SOLID, with_bodies, with_copies
 from gsim3d.viewer.live import Target
 
 OPERATIONS = {"move": Move, "throw": Throw, "remove": Remove, "duplicate": Duplicate, "recolor": Recolor}
@@ -31,11 +30,10 @@ PATIENCE = 1.0  # seconds; a setting whose rounds have taken so long is not time
 MARGIN = 0.03  # of the longest side of a body, around it
 HIT, NEAR = 2.0, 0.01  # a ray hits what is nearer to it than so many standard deviations, or such a share of the depth
 SEEN = 0.2  # least opacity of what a ray hits
-BODIES = SegmentationConfig(neighbors=12, min_share=0.02, neck=0.3)  # tells a small one from a cloth
 Box = tuple[Sequence[float], Sequence[float]]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Part:
     """Steps that were predicted in one go."""
 
@@ -44,6 +42,7 @@ class Part:
     history: Particles  #: steps before it as the model saw them, after the edits
     steps: list[Particles]  #: predicted particles
     plan: Plan  #: by which they were predicted
+    seconds: float  #: that a step took
 
 
 @dataclass(frozen=True)
@@ -58,16 +57,12 @@ class Switch:
 
 @dataclass(frozen=True)
 class OfBody(Selection):
-    """Particles of one body, in the steps where bodies are known: not in those of images before the newest."""
+    """Particles of one body."""
 
-    body: tuple[float, ...] = ()  #: as in :class:`gsim3d.state.Particles`; empty: any
+    body: int = 0  #: its number, the ``label`` of its particles
 
     def mask(self, particles: Particles) -> Tensor:
-        chosen = super().mask(particles)
-        if particles.body is None or not self.body:
-            return chosen
-        clouds, is_mine = particles.row_cloud(), (particles.body == particles.body.new_tensor(self.body)).all(1)
-        chosen = chosen & (is_mine | ~torch.isin(clouds, clouds[is_mine]))
+        chosen = super().mask(particles) & (particles.label == self.body)
         if not bool(chosen[newest_mask(particles)].any()):
             raise InputError("the selection is empty: the box holds nothing of the chosen body")
         return chosen
@@ -78,6 +73,7 @@ class Simulation:
 
     Attributes:
         target: what it shows: given frames, then predicted ones.
+        parts: what was predicted up to now.
         effects: what the next predicted part computes.
         seconds_a_step: that the last prediction took.
     """
@@ -91,20 +87,15 @@ class Simulation:
         Raises:
             InputError: the scene has too few steps or cameras.
         """
-        self._simulator, self._parts, self.seconds_a_step = restored.simulator, [], 0.0
+        self._simulator, self.seconds_a_step = restored.simulator, 0.0
+        self.parts: list[Part] = []
         self._frames: Frames | None = None
-        self._spreads: dict[int, Tensor] = {}  # first step of a part -> spread of its particles
+        self._spreads: dict[Part, Tensor] = {}
         spec, plan = restored.plan.spec, restored.plan
-        self.effects = dataclasses.replace(
-            spec,
-            dynamics=dataclasses.replace(spec.dynamics, history=plan.history),
-            appearance=dataclasses.replace(
-                spec.appearance,
-                view_dependent=plan.sh_degree,
-                opacity_changes="opacity_changes" in plan.on or spec.appearance.opacity_changes,
-            ),
-            outputs=OutputEffects(),
-        )
+        fades = "opacity_changes" in plan.on or spec.appearance.opacity_changes
+        dynamics = dataclasses.replace(spec.dynamics, history=plan.history)
+        appearance = dataclasses.replace(spec.appearance, view_dependent=plan.sh_degree, opacity_changes=fades)
+        self.effects = EffectsSpec(dynamics, appearance, spec.structure, OutputEffects())
         about = {"name": "state", "fps": restored.fps or 24.0}
         if isinstance(source, Scene):
             inputs = restored.simulator.inputs
@@ -116,10 +107,10 @@ class Simulation:
             n_steps = n_steps or max(1, source.n_steps - start - state.n_clouds)
         else:
             state = source.to(restored.device)
-        self._state, self._sh_degree = state, plan.sh_degree
+        self._state, self._sh_degree = with_bodies(state), plan.sh_degree
         offset = state.world_offset
         self._offset = [0.0, 0.0, 0.0] if offset is None else offset[0].tolist()
-        given = [state.select_clouds([cloud]) for cloud in range(state.n_clouds)]
+        given = [self._state.select_clouds([cloud]) for cloud in range(state.n_clouds)]
         bounds = None if self._simulator.trust is None else self._bounds
         self.target = Target(draw=self._draw, particles=given, n_encoded=len(given), bounds=bounds, **about)
         self.simulate_on(len(given) - 1, n_steps or 12)
@@ -127,26 +118,34 @@ class Simulation:
     @property
     def edits(self) -> tuple[Edit, ...]:
         """Changes of the scene up to now, their steps counted from the first predicted one."""
-        return tuple(edit for part in self._parts for edit in part.edits)
+        return tuple(edit for part in self.parts for edit in part.edits)
 
     def _draw(self, particles: Particles) -> Gaussians:
         return self._simulator.renderer(particles, sh_degree=self._sh_degree)
 
+    def _part_before(self, step: int) -> Part | None:
+        """The one that predicted the step before ``step``; None: it was given."""
+        return next((part for part in reversed(self.parts) if part.first < step), None)
+
     def _bounds(self, frame: int) -> Tensor:
-        """Bounds of the errors of a frame's particles, [N] metres on the CPU; predicts variants of a part once."""
+        """Bounds of the errors of a frame's particles, [N] metres on the CPU."""
         step, particles = frame - self.target.n_encoded, self.target.particles[frame]
-        part = next((part for part in reversed(self._parts) if part.first <= step), None)
+        part = self._part_before(step + 1)
         if part is None:
             return torch.zeros(particles.n_rows)
-        if part.first not in self._spreads:
+        bounds = self._simulator.trust.bound(self.spread(part), first=part.first + 1)[step - part.first]
+        return torch.where(particles.activity.cpu() == DYNAMIC, bounds, 0).float()
+
+    @torch.no_grad()
+    def spread(self, part: Part) -> Tensor:
+        """Spread of the particles over variants of a part, [S, N] metres on the CPU; predicts them the first time."""
+        if part not in self._spreads:
             histories = [part.history]
             if part.first == 0 and not part.edits and self._frames is not None:
-                with torch.no_grad():
-                    histories = encode_histories(self._simulator, self._frames)
+                histories = encode_histories(self._simulator, self._frames)
             made = rollout_with_spread(self._simulator, histories, len(part.steps), part.plan)
-            self._spreads[part.first] = made[1].cpu()
-        bounds = self._simulator.trust.bound(self._spreads[part.first], first=part.first + 1)[step - part.first]
-        return torch.where(particles.activity.cpu() == DYNAMIC, bounds, 0).float()
+            self._spreads[part] = made[1].cpu()
+        return self._spreads[part]
 
     def _step_after(self, frame: int) -> int:
         step, n_given = frame + 1 - self.target.n_encoded, self.target.n_encoded
@@ -156,49 +155,62 @@ class Simulation:
 
     def _history(self, step: int) -> Particles:
         """Steps before ``step``, as the model saw or made them."""
-        part = next((part for part in reversed(self._parts) if part.first < step), None)
+        part = self._part_before(step)
         if part is None:
             return self._state
         known = concatenate([part.history, *part.steps[: step - part.first]])
         return last_steps(known, 2**self._simulator.config.dynamics.history_bits)
 
-    def _timed(self, history: Particles, n_steps: int, plan: Plan) -> tuple[list[Particles], float]:
-        """Predicted steps, and the seconds that one and its Gaussians took."""
+    def _timed(self, history: Particles, n_steps: int, plan: Plan) -> tuple[list[Particles], Plan, float]:
+        """Predicted steps, their plan, and the seconds that one and its Gaussians took."""
         began = time.perf_counter()
         steps = self._simulator.rollout(history, n_steps, plan)
         for particles in steps:
             drawn = self._simulator.renderer(particles, sh_degree=plan.sh_degree)
         drawn.means.sum().item()  # waits for the device
-        return steps, (time.perf_counter() - began) / n_steps
+        return steps, plan, (time.perf_counter() - began) / n_steps
 
-    @torch.no_grad()
-    def simulate_on(self, frame: int, n_steps: int, operations: Sequence[Operation] = ()) -> float:
+    def simulate_on(self, frame: int, n_steps: int, operations: Sequence[Operation] = ()) -> None:
         """Predicts the frames after ``frame`` anew, with the effects that are on; earlier edits stay, later ones go.
 
-        The scene changes by ``operations`` right after ``frame``. Returns the seconds that a step took.
+        The scene changes by ``operations`` right after ``frame``.
 
         Raises:
             InputError: an operation cannot be made, and nothing has changed; or ``frame`` is not the last given or a
                 predicted one.
         """
+        self.take(self.predicted(frame, n_steps, operations, self.effects))
+
+    @torch.no_grad()
+    def predicted(self, frame: int, n_steps: int, operations: Sequence[Operation], effects: EffectsSpec) -> Part:
+        """What :meth:`simulate_on` then shows by :meth:`take`; changes nothing. Raises what it raises."""
         step = self._step_after(frame)
         if n_steps < 1:
             raise InputError(f"simulate on: steps must be at least 1; got {n_steps}")
         edits = tuple(Edit(step, one) for one in operations)
-        plan = self._simulator.plan(dataclasses.replace(self.effects, structure=structure_of(edits)))
+        plan = self._simulator.plan(dataclasses.replace(effects, structure=structure_of(edits)))
         history = self._simulator._prepare(self._history(step), plan)
         for edit in edits:
+            counts = history.clouds.counts
             history = edit.apply(history, self._simulator._colors)
+            history = with_copies(history, counts) if edit.operation.inserts else history
         history = self._simulator.dynamics.initialize(history) if edits else history
-        steps, self.seconds_a_step = self._timed(history, n_steps, plan)
-        self._parts = [part for part in self._parts if part.first < step] + [Part(step, edits, history, steps, plan)]
-        self._spreads = {first: spread for first, spread in self._spreads.items() if first < step}
-        self._sh_degree = plan.sh_degree
-        self.target.replace([*self.target.particles[: frame + 1], *steps])
-        return self.seconds_a_step
+        return Part(step, edits, history, *self._timed(history, n_steps, plan))
+
+    def take(self, part: Part) -> None:
+        """Shows a predicted part instead of the frames from its first one on."""
+        self.parts = [one for one in self.parts if one.first < part.first] + [part]
+        self._spreads = {one: spread for one, spread in self._spreads.items() if one in self.parts}
+        self._sh_degree, self.seconds_a_step = part.plan.sh_degree, part.seconds
+        self.target.replace([*self.target.particles[: part.first + self.target.n_encoded], *part.steps])
+
+    def operations(self, frame: int, more: Operation | None) -> list[Operation]:
+        """Those right after ``frame`` and ``more``, in place of one of its kind on the same particles; None: none."""
+        made = [edit.operation for edit in self.edits if edit.step == self._step_after(frame)]
+        return [one for one in made if (type(one), one.of) != (type(more), more.of)] + [more] if more else []
 
     def operation(
-        self, name: str, which: str, vector: Sequence[float], box: Box | None = None, body: Sequence[float] = ()
+        self, name: str, which: str, vector: Sequence[float], box: Box | None = None, body: int | None = None
     ) -> Operation:
         """The operation that a user chose.
 
@@ -207,7 +219,7 @@ class Simulation:
             which: particles, as of :class:`gsim3d.effects.selection.Selection`.
             vector: metres of a move or a copy, metres a step of a throw, or a colour.
             box: lowest and highest corner, in the axes of the viewer; None: everywhere.
-            body: value of the particles of the only body that is meant; empty: any.
+            body: number of the only body that is meant; None: any.
         Raises:
             InputError: there is no such operation or selection.
         """
@@ -216,34 +228,25 @@ class Simulation:
         moved = (zip(corner, self._offset, strict=True) for corner in box or ())
         corners = tuple(tuple(float(x) + o for x, o in corner) for corner in moved) or None
         fields = {VECTORS[name]: tuple(float(x) for x in vector)} if name in VECTORS else {}
-        return OPERATIONS[name](OfBody(which, corners, tuple(body)), **fields)
+        of = Selection(which, corners) if body is None else OfBody(which, corners, body)
+        return OPERATIONS[name](of, **fields)
 
     # Bodies
 
-    @torch.no_grad()
-    def bodies(self, frame: int) -> list[Tensor]:
-        """Rows of the particles of each body of a frame, int64, the largest body first."""
-        particles = self.target.particles[frame]
-        rows = (particles.activity != FROZEN).nonzero()[:, 0]
-        if not len(rows):
-            return []
-        body = particles.body  # known where the model segments bodies, from the newest encoded step on
-        if body is None or torch.equal(body[rows], particles.means[rows]):
-            while frame >= self.target.n_encoded and self.target.particles[frame - 1].n_rows == len(particles.means):
-                frame -= 1  # to the same particles before bodies touched
-            particles = self.target.particles[frame]
-            body = segment_bodies(Movable(particles, self._simulator.config.dynamics.grid_size), particles, BODIES)
-        _, label, count = torch.unique(body[rows], dim=0, return_inverse=True, return_counts=True)
-        return [rows[label == one] for one in count.argsort(descending=True).tolist()]
+    def bodies(self, frame: int) -> dict[int, Tensor]:
+        """Number of each body of a frame -> rows of its particles, int64."""
+        label = self.target.particles[frame].label
+        return {body: (label == body).nonzero()[:, 0] for body in label.unique().tolist() if body >= 0}
 
-    def box_of(self, frame: int, rows: Tensor) -> Box:
-        """Lowest and highest corner of a body of ``frame`` in the steps that the model goes on from after it."""
-        points = [self.target.particles[frame].means[rows]]
-        for before in range(frame - 1, max(-1, frame - self.effects.dynamics.history), -1):
-            means, middle = self.target.particles[before].means, points[-1].mean(0)
-            found = [means[one] for one in self.bodies(before)]
-            points += [min(found, key=lambda one: float((one.mean(0) - middle).norm()))] if found else []
-        low, high = torch.cat(points).amin(0), torch.cat(points).amax(0)
+    def box_of(self, frame: int, body: int) -> Box:
+        """Lowest and highest corner of a body of ``frame``, also in the steps that the model goes on from after it."""
+        known = self.target.particles[frame]
+        if frame >= self.target.n_encoded - 1:
+            known = last_steps(self._history(self._step_after(frame)), self.effects.dynamics.history)
+        chosen = known.label == body
+        solid = chosen & (known.opacities > SOLID)
+        points = known.means[solid if bool(solid.any()) else chosen]
+        low, high = points.amin(0), points.amax(0)
         margin = MARGIN * (high - low).max().clamp(min=1e-3)
         return (low - margin).tolist(), (high + margin).tolist()
 
@@ -304,7 +307,7 @@ class Simulation:
             progress(len(found) / len(specs))
             plan, times = self._simulator.plan(spec), []
             while len(times) < ROUNDS and TIMED * sum(times) < PATIENCE:
-                times.append(self._timed(history, TIMED, plan)[1])
+                times.append(self._timed(history, TIMED, plan)[2])
             found[digest] = 1000 * min(times)
         progress(1.0)
         return [(one.name, label, found[spec.hash]) for one in switches for label, spec in one.settings.items()]

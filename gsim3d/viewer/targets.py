@@ -2,6 +2,7 @@
 
 import dataclasses
 import warnings
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,7 +41,10 @@ def open_target(
     path = Path(target)
     if path.is_file() and state_of(path):
         raise InputError(f"{path}: a state is drawn by its simulator: name it with --checkpoint")
-    if path.is_dir() and not (path / GAUSSIANS).is_dir() and _is_scene(path):
+    is_scene = False
+    with suppress(InputError):
+        is_scene = path.is_dir() and not (path / GAUSSIANS).is_dir() and layouts.layout_of(path) is not None
+    if is_scene:
         if scene is not None or up is not None:
             raise InputError(f"{path} is a recorded scene; --scene and --up belong to files of Gaussians")
         recorded = Scene.open(path)
@@ -84,28 +88,15 @@ class _InAxesOf:
         return len(self.sequence)
 
     def __getitem__(self, frame: int) -> Gaussians:
-        return _in_axes_of(self.scene, self.sequence[frame])
-
-
-def _is_scene(folder: Path) -> bool:
-    try:
-        layouts.layout_of(folder)
-    except InputError:
-        return False
-    return True
+        gaussians, offset = self.sequence[frame], torch.as_tensor(self.scene.world_offset, dtype=torch.float64)[None]
+        if not offset.any() and gaussians.world_offset is None:
+            return gaussians
+        own = torch.zeros(1, 3, dtype=torch.float64) if gaussians.world_offset is None else gaussians.world_offset
+        means = (gaussians.means.double() + own - offset).float()
+        return dataclasses.replace(gaussians, means=means, world_offset=offset)
 
 
 def _checked(scene: Scene, start: int) -> int:
     if not 0 <= start < scene.n_steps:
         raise InputError(f"--start {start}: {scene.path} has {scene.n_steps} steps, from 0")
     return start
-
-
-def _in_axes_of(scene: Scene, gaussians: Gaussians) -> Gaussians:
-    """``gaussians`` with positions that count from the point that the scene's cameras count from."""
-    offset = torch.as_tensor(scene.world_offset, dtype=torch.float64)[None]
-    if not offset.any() and gaussians.world_offset is None:
-        return gaussians
-    own = torch.zeros(1, 3, dtype=torch.float64) if gaussians.world_offset is None else gaussians.world_offset
-    means = (gaussians.means.double() + own - offset).float()
-    return dataclasses.replace(gaussians, means=means, world_offset=offset)

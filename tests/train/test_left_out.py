@@ -46,8 +46,8 @@ def test_no_gradient_to_particles_of_the_target_camera(trainer):
     state = with_views(simulator.encode(batch.context), batch.context)
     steps = simulator.rollout(state, 1, trainer.plan)
     particles = concatenate([state, *steps])
-    assert particles.view.bincount().tolist() == [(particles.view == v).sum() for v in range(3)]
-    assert min(particles.view.bincount()) > 0
+    assert particles.label.bincount().tolist() == [(particles.label == v).sum() for v in range(3)]
+    assert min(particles.label.bincount()) > 0
     leaf = particles.means.detach().requires_grad_()
     particles = dataclasses.replace(particles, means=leaf)
     views = images_per_cloud(batch.context)
@@ -59,8 +59,8 @@ def test_no_gradient_to_particles_of_the_target_camera(trainer):
     )
     for view in range(3):
         (gradient,) = torch.autograd.grad(images[view::3].square().sum(), leaf, retain_graph=True)
-        assert (gradient[particles.view == view] == 0).all()
-        assert all(gradient[particles.view == other].abs().max() > 0 for other in range(3) if other != view)
+        assert (gradient[particles.label == view] == 0).all()
+        assert all(gradient[particles.label == other].abs().max() > 0 for other in range(3) if other != view)
 
 
 def test_particles_know_the_image_they_come_from(trainer):
@@ -68,7 +68,7 @@ def test_particles_know_the_image_they_come_from(trainer):
     state = with_views(trainer.simulator.encode(frames), frames)
     counts = frames.masks.flatten(1).sum(1).view(-1, 3)
     expected = torch.cat([torch.arange(3).repeat_interleave(row) for row in counts])
-    assert state.view.tolist() == expected.tolist()
+    assert state.label.tolist() == expected.tolist()
 
 
 @pytest.mark.parametrize("leaves_out", [False, True])

@@ -1,14 +1,14 @@
 """Films: labels, times and sizes of their panels."""
 
+import re
+
 import cv2
 import numpy as np
 import pytest
 
 from gsim3d.cli.main import main
 from gsim3d.data import Scene
-from gsim3d.errors import InputError
 from gsim3d.io.formats import write_splats
-from gsim3d.viewer.export import export
 from gsim3d.viewer.films import ACCENT, film_frames
 from tests.tiny_scenes import write_scene
 from tests.viewer.test_player import make, unpacked
@@ -58,19 +58,24 @@ def n_frames(path):
     return n
 
 
-def test_export_goes_once_around_a_single_frame(tmp_path):
+def export(target, to, *options):
+    assert main(["export", str(target), "--to", str(to), *options]) == 0
+
+
+def test_export_goes_once_around_a_single_frame(tmp_path, capsys):
     write_splats(tmp_path / "a.ply", make())
-    with pytest.raises(InputError, match=r"a\.avi: no format .* has this suffix; choose from .*\.ply, .*\.mp4, \.html"):
-        export(tmp_path / "a.ply", tmp_path / "a.avi")
-    said = export(tmp_path / "a.ply", tmp_path / "a.mp4", size=64, fps=5)
-    assert "64x64" in said and n_frames(tmp_path / "a.mp4") == 30
+    assert main(["export", str(tmp_path / "a.ply"), "--to", str(tmp_path / "a.avi")]) == 2
+    says = capsys.readouterr().err
+    assert re.search(r"a\.avi: no format .* has this suffix; choose from .*\.ply, .*\.mp4, \.html", says)
+    export(tmp_path / "a.ply", tmp_path / "a.mp4", "--size", "64", "--fps", "5")
+    assert "64x64" in capsys.readouterr().out and n_frames(tmp_path / "a.mp4") == 30
 
 
 def test_export_writes_the_time_into_videos(tmp_path):
     (tmp_path / "run").mkdir()
     for step in range(2):
         write_splats(tmp_path / "run" / f"step_{step}.ply", make())
-    export(tmp_path / "run", tmp_path / "a.mp4", size=256, fps=2, turns=0)
+    export(tmp_path / "run", tmp_path / "a.mp4", "--size", "256", "--fps", "2", "--turns", "0")
     video = cv2.VideoCapture(str(tmp_path / "a.mp4"))
     first, second = (video.read()[1].astype(int) for _ in range(2))
     assert np.abs(first - second)[:28, -80:].max() > 60 and np.abs(first - second)[40:].max() < 60

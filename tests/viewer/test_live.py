@@ -1,8 +1,10 @@
 """The live viewer: timeline, layers, colours, targets and edits without a browser; its server; Chromium."""
 
+import asyncio
 import dataclasses
 import subprocess
 import sys
+import threading
 import time
 import types
 import urllib.request
@@ -12,9 +14,9 @@ import pytest
 import torch
 
 from gsim3d.cli.main import main
-from gsim3d.effects.edits import Move
+from gsim3d.effects.edits import Move, Recolor, Throw
 from gsim3d.errors import InputError
-from gsim3d.io import read_splats, write_ply
+from gsim3d.io import read_splats, write_ply, write_splats
 from gsim3d.io.sequence import write_about
 from gsim3d.math.spherical_harmonics import SH_0
 from gsim3d.state import ASLEEP, DYNAMIC, FROZEN, Gaussians
@@ -254,25 +256,102 @@ def test_server_answers_on_a_free_port_and_gives_it_back(viser):
     assert server.free_port("127.0.0.1", port) == port
 
 
+class Clicks:
+    """Presses what a viewer listens to, as a browser's message does."""
+
+    def __init__(self):
+        self.said = []
+        self._client = types.SimpleNamespace(add_notification=lambda *args, **_: self.said.append(args))
+
+    def on_click(self, call):
+        self.call = call
+
+    def __call__(self):
+        asyncio.run(self.call(types.SimpleNamespace(client=self._client)))
+
+
+def until(condition):
+    end = time.monotonic() + 30
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.01)
+    assert condition()
+
+
 def test_viewer_simulates_on_from_the_frame_that_is_shown(viser, simulation):
     with server.Viewer(simulation.target, simulation) as viewer:
         viewer.timeline.seek(2)
-        viewer.simulate_on(6, [Move("all", (0.0, 0.0, 0.1))])
+        viewer.simulate_on(2, 6, Move("all", (0.0, 0.0, 0.1)), simulation.effects)
         assert viewer.timeline.n_frames == 9 and viewer.timeline.frame == 2
+
+
+def test_clicks_during_a_simulation_are_done_in_order_as_they_were_meant(viser, simulation, monkeypatch):
+    may_go, predicted, asked = threading.Event(), simulation.predicted, []
+
+    def slowly(frame, n_steps, operations, effects):
+        asked.append((frame, n_steps, list(operations), effects.dynamics.history))
+        may_go.wait(30)
+        return predicted(frame, n_steps, operations, effects)
+
+    monkeypatch.setattr(simulation, "predicted", slowly)
+    with server.Viewer(simulation.target, simulation) as viewer:
+        panel, click = viewer._panel, Clicks()
+        viewer.on(click, panel._simulate, "on_click")
+        viewer.timeline.seek(2)
+        panel._steps.value = 3
+        for edit, up in (("move", 0.5), ("throw", 0.25), ("move", 0.5), ("move", 0.75)):
+            panel._edit.value, panel._vector.value = edit, (0.0, 0.0, up)
+            click()
+        simulation.choose("history", "1 step")
+        viewer.timeline.seek(3)
+        panel._edit.value = "recolor"
+        click()
+        panel._edit.value, panel._vector.value = "none", (0.0, 0.0, 9.0)
+        simulation.choose("history", "2 steps")
+        until(lambda: "at work (5 to do)" in viewer._status.content)
+        assert viewer.timeline.n_frames == 5 and simulation.edits == ()
+        may_go.set()
+        until(lambda: "at work" not in viewer._status.content)
+        move, last = (Move("moving", (0.0, 0.0, up)) for up in (0.5, 0.75))
+        throw, red = Throw("moving", (0.0, 0.0, 0.25)), Recolor("moving", (220 / 255, 40 / 255, 40 / 255))
+        assert [one[2] for one in asked[:4]] == [[move], [move, throw], [throw, move], [throw, last]]
+        assert asked[4] == (3, 3, [red], 1) and asked[0][3] == 2
+        assert [(edit.step, edit.operation) for edit in simulation.edits] == [(1, throw), (1, last), (2, red)]
+        assert viewer.timeline.n_frames == 7 and not click.said
+
+
+def test_what_fails_in_the_clock_is_shown_and_stops_time(viser, tmp_path, capsys):
+    for step, frame in enumerate(falling()):
+        write_splats(tmp_path / f"step_{step}.ply", frame)
+    (tmp_path / "step_2.ply").write_bytes(b"ply")
+    with server.Viewer(open_target(tmp_path)) as viewer:
+        click = Clicks()
+        viewer.server.get_clients = lambda: {0: click._client}
+        viewer.timeline.play()
+        until(lambda: click.said)
+        assert "step_2.ply" in click.said[0][1] and not viewer.timeline.playing and viewer._play.label == "Play"
+        viewer.timeline.seek(3)
+        viewer.on(click, lambda: None, "on_click")
+        click()
+        until(lambda: "frame 3 of 4" in viewer._status.content)
+        viewer.on(click, lambda: 1 / 0, "on_click")
+        click()
+        assert "ZeroDivisionError" in click.said[1][1]
+    assert "ZeroDivisionError" in capsys.readouterr().err
 
 
 def test_errors_of_files_are_shown_and_a_home_is_meant(viser, simulation, tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "file").touch()
     with server.Viewer(simulation.target, simulation) as viewer:
-        calls, said = [], []
-        handle = types.SimpleNamespace(on_click=calls.append)
-        client = types.SimpleNamespace(add_notification=lambda *args, **_: said.append(args[1]))
-        viewer.on(handle, lambda: viewer._export("~/seen.ply", False), "on_click")
-        viewer.on(handle, lambda: (tmp_path / "file" / "a.ply").touch(), "on_click")
-        for call in calls:
-            call(types.SimpleNamespace(client=client))
-    assert (tmp_path / "seen.ply").is_file() and len(said) == 1 and "a.ply" in said[0]
+        click = Clicks()
+        viewer.on(click, lambda: viewer._export("~/seen.ply", False), "on_click")
+        click()
+        until(lambda: click.said)
+        viewer.on(click, lambda: (tmp_path / "file" / "a.ply").touch(), "on_click")
+        click()
+    (title, what), (_, error) = click.said
+    assert title == "Written" and str(tmp_path / "seen.ply") in what and (tmp_path / "seen.ply").is_file()
+    assert "a.ply" in error
 
 
 def test_view_command_prints_the_address_and_ends_with_ctrl_c(viser, run, scene, checkpoint, monkeypatch, capsys):

@@ -10,17 +10,17 @@ import torch
 from gsim3d.cameras import InputSpec
 from gsim3d.cli.main import main
 from gsim3d.effects.edits import Duplicate, Move, Recolor, Remove, Throw
-from gsim3d.effects.selection import newest_mask
 from gsim3d.errors import FitWarning, InputError
 from gsim3d.io import read_particles, write_particles
 from gsim3d.io.particles import STATE
 from gsim3d.math.spherical_harmonics import SH_0
 from gsim3d.numerics.trust import Trust
-from gsim3d.state import FROZEN, concatenate
+from gsim3d.state import FROZEN, CloudTable, concatenate
 from gsim3d.train.restore import restore
 from gsim3d.viewer import server
+from gsim3d.viewer.bodies import with_bodies
 from gsim3d.viewer.live import FROZEN_COLOR, Layers
-from gsim3d.viewer.simulation import Simulation, hit
+from gsim3d.viewer.simulation import OfBody, Simulation, hit
 from gsim3d.viewer.targets import open_state, open_target
 from tests.effects.models import EXPLICIT_CONFIG
 from tests.test_simulator import SIZE, awake, make_simulator
@@ -86,42 +86,87 @@ def test_bodies_are_found_and_boxes_hold_them_in_the_history(simulation):
     for frame in (1, 3):
         particles = target.particles[frame]
         bodies = simulation.bodies(frame)
-        rows = torch.cat(bodies).sort().values
+        rows = torch.cat(list(bodies.values())).sort().values
         assert torch.equal(rows, (particles.activity != FROZEN).nonzero()[:, 0])
-        low, high = map(torch.tensor, simulation.box_of(frame, bodies[0]))
+        low, high = map(torch.tensor, simulation.box_of(frame, 0))
         means = particles.means[bodies[0]]
         assert bool(((means >= low) & (means <= high)).all())
         if frame == 3:  # rows of predicted steps are the same particles
             before = target.particles[2].means[bodies[0]]
             assert bool(((before >= low) & (before <= high)).all())
-    known = [len(rows) for rows in simulation.bodies(1)]
-    unknown = dataclasses.replace(target.particles[1], body=target.particles[1].means)  # as of steps before the newest
-    target.replace([target.particles[0], unknown, *target.particles[2:]])
-    assert [len(rows) for rows in simulation.bodies(1)] == known and known[0] > 1
-    apart = dataclasses.replace(target.particles[3], body=target.particles[3].means.round())
-    target.replace([*target.particles[:3], apart, *target.particles[4:]])
-    sizes = [len(rows) for rows in simulation.bodies(3)]
-    assert len(sizes) > 1 and sizes == sorted(sizes, reverse=True)
-    target.replace([dataclasses.replace(apart, activity=torch.full_like(apart.activity, FROZEN))])
-    assert simulation.bodies(0) == []
+    target.replace([dataclasses.replace(particles, label=torch.full_like(particles.label, -1))])
+    assert simulation.bodies(0) == {}
 
 
-def test_bodies_that_touch_later_stay_two_and_a_small_one_is_no_part_of_a_cloth(simulation):
+def cloth_and_ball(given, heights, seed=0):
+    """Encoded steps: a square of 600 particles, and 60 of a ball at other heights above it."""
+    steps, random = [], torch.Generator().manual_seed(seed)
+    for step, height in enumerate(heights):
+        square = torch.rand(600, 3, generator=random) * torch.tensor([2.0, 2.0, 0.0])
+        ball = torch.randn(60, 3, generator=random)
+        ball = torch.tensor([1.0, 1.0, height]) + 0.2 * ball / ball.norm(dim=1, keepdim=True)
+        cloud = given.select_clouds([given.n_clouds - 1])
+        some = (cloud.activity != FROZEN).nonzero()[:, 0][:1].repeat(660)
+        fields = {name: values[some] for name, values in cloud.row_fields().items()}
+        order = torch.randperm(660, generator=random)  # steps do not have the same particles
+        fields |= {"means": torch.cat([square, ball])[order], "opacities": torch.full((660,), 0.9)}
+        table = CloudTable.make([660], [0], [step], given.cu_rows.device)
+        steps.append(cloud.with_clouds(table, **fields))
+    return concatenate(steps), torch.cat([one.means[:, 2] > 0.05 for one in steps])
+
+
+@pytest.mark.parametrize("heights", [(1.0, 0.8), (0.6, 0.12), (0.12, 0.6)], ids=["apart", "touches", "leaves"])
+def test_bodies_of_all_given_steps_are_separated(simulation, heights):
+    state, is_ball = cloth_and_ball(simulation._state, heights)
+    state = dataclasses.replace(state, activity=state.activity.where(torch.arange(len(is_ball)) % 7 > 0, FROZEN))
+    label = with_bodies(state).label
+    assert bool((label[state.activity == FROZEN] == -1).all())
+    moving = state.activity != FROZEN
+    for found, of_ball in zip(label[moving].chunk(2), is_ball[moving].chunk(2), strict=True):
+        assert ((found == 1) == of_ball).float().mean() > 0.95 and set(found.tolist()) == {0, 1}
+
+
+@pytest.mark.parametrize("heights", [(2.0, 1.0), (1.0, 2.0)])
+def test_pieces_that_a_single_step_lacks_are_no_bodies(simulation, heights):
+    state, is_ball = cloth_and_ball(simulation._state, (*heights, 0.1))
+    later = state.clouds.counts[0] * 2
+    sparse = is_ball & (torch.arange(len(is_ball)) < later)  # nearly all of the ball is hidden in two of three steps
+    sparse &= torch.arange(len(is_ball)) % 660 > 5
+    assert set(with_bodies(state.select_rows(~sparse)).label.tolist()) == {0}
+
+
+def test_an_edit_of_a_body_takes_nothing_else_of_its_box(simulation, checkpoint):
+    state, is_ball = cloth_and_ball(simulation._state, (0.9, 0.7))
+    simulation = Simulation(restore(checkpoint), state, 2)
     target = simulation.target
-    given = target.particles[1]
-    many = (given.activity != FROZEN).nonzero()[:, 0][:1].repeat(640)
-    fields = {name: values[many] for name, values in given.row_fields().items() if name != "body"}
-    is_small = torch.arange(640) < 40
-    square = torch.rand(640, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([2.0, 2.0, 0.0])
-    means = square * (1 - 0.75 * is_small.float()[:, None])
-    fallen = []
-    for height in (1.0, 0.5, 0.0):
-        fields["means"] = means + is_small[:, None] * torch.tensor([0.0, 0.0, height])
-        cloud = dataclasses.replace(given, body=None)
-        fallen.append(cloud.with_clouds(cloud.clouds.with_counts([640]), **fields))
-    target.replace([target.particles[0], *fallen])
-    for frame in (1, 2, 3):
-        assert [len(rows) for rows in simulation.bodies(frame)] == [600, 40]
+    frames = [one.label == 1 for one in target.particles]
+    assert [int(one.sum()) for one in frames] == [60] * 4 and torch.equal(torch.cat(frames[:2]), is_ball)
+    down = Move(OfBody("all", None, 1), (0.0, 0.0, -0.7))  # into the cloth
+    simulation.simulate_on(1, 2, [down])
+    history, before = simulation.parts[0].history, simulation._state.means
+    assert torch.equal((history.means != before).any(1), is_ball)  # in every step that the model goes on from
+    low, high = map(torch.tensor, simulation.box_of(2, 1))
+    cloth = target.particles[2].means[target.particles[2].label == 0]
+    assert ((cloth >= low) & (cloth <= high)).all(1).any()  # they overlap, and are still two
+    simulation.simulate_on(2, 1, [Remove(OfBody("all", None, 1))])
+    assert simulation.bodies(3).keys() == {0} and len(simulation.bodies(3)[0]) == 600
+    simulation.simulate_on(2, 2, [Duplicate(OfBody("all", None, 1), (0.0, 0.0, 1.0))])
+    assert {body: len(rows) for body, rows in simulation.bodies(4).items()} == {0: 600, 1: 60, 2: 60}
+    simulation.simulate_on(4, 1, [Recolor(OfBody("all", None, 2), (1.0, 0.0, 0.0))])
+    with pytest.raises(InputError, match="edit at step 3, move: the selection is empty: the box holds nothing of"):
+        simulation.simulate_on(4, 1, [Move(OfBody("all", None, 3), (0.0, 0.0, 1.0))])
+
+
+def test_edits_after_one_frame_add_up_and_repeated_ones_count_once(simulation):
+    up, other = Move("all", (0.0, 0.0, 0.5)), Move("all", (0.0, 0.0, 0.25))
+    red = Recolor("moving", (1.0, 0.0, 0.0))
+    simulation.simulate_on(2, 2, simulation.operations(2, up))
+    once = simulation.target.particles[3].means
+    simulation.simulate_on(2, 2, simulation.operations(2, up))
+    assert torch.equal(simulation.target.particles[3].means, once)
+    assert simulation.operations(2, red) == [up, red] and simulation.operations(3, red) == [red]
+    simulation.simulate_on(2, 2, [up, red])
+    assert simulation.operations(2, other) == [red, other] and simulation.operations(2, None) == []
 
 
 def test_a_ray_hits_the_nearest_gaussian_that_is_shown():
@@ -207,11 +252,11 @@ def test_panel_edits_the_body_that_is_chosen(viser, simulation, name, kind):
         panel._vector.value, panel._color.value, panel._steps.value = (0.0, 1.5, 0.5), (255, 0, 0), 2
         rows, before = simulation.bodies(2)[0], target.particles[3]
         color = body_color(simulation, 3, rows)
-        panel._simulate()
+        panel._simulate()()
         assert viewer.timeline.n_frames == 5 and "ms a simulated step" in viewer._status.content
         assert panel._which.value.startswith("body 1") and panel._inside.value  # to try again with another vector
         (edit,) = simulation.edits
-        assert isinstance(edit.operation, kind) and edit.step == 1 and edit.operation.of.box is not None
+        assert isinstance(edit.operation, kind) and edit.step == 1 and edit.operation.of == OfBody("all", None, 0)
         if name == "move":
             shift = (target.particles[3].means - before.means)[rows].mean(0)
             assert shift.tolist() == pytest.approx([0, 1.5, 0.5], abs=0.2)
@@ -254,29 +299,30 @@ def test_a_click_chooses_a_body_or_the_background_until_another_frame_is_shown(v
 
 
 def test_panel_edits_one_of_two_bodies_that_overlap(viser, simulation):
-    target, state = simulation.target, simulation._state
-    body = torch.zeros_like(state.means)
-    simulation._state = dataclasses.replace(state, body=body.where(~newest_mask(state)[:, None], body + 1))
+    target = simulation.target
     simulation.simulate_on(1, 2, [Duplicate("moving", (0.0, 0.0, 0.01))])
     with server.Viewer(target, simulation) as viewer:
-        panel, sizes = viewer._panel, [len(rows) for rows in simulation.bodies(2)]
-        assert len(sizes) == 2 and sizes[0] == sizes[1]
+        panel, given = viewer._panel, simulation.bodies(1)
+        sizes = {body: len(rows) for body, rows in simulation.bodies(2).items()}
+        assert list(sizes) == list(range(2 * len(given))) and sizes[0] == sizes[len(given)] == len(given[0])
         viewer.timeline.seek(2)
         viewer.draw()
-        panel._which.value, panel._edit.value, panel._steps.value = panel._which.options[4], "remove", 2
+        panel._which.value, panel._edit.value, panel._steps.value = panel._which.options[3 + len(given)], "remove", 2
         panel._choose()
-        panel._simulate()
-        assert target.particles[3].n_rows == target.particles[2].n_rows - sizes[1]
-        assert [len(rows) for rows in simulation.bodies(4)] == sizes[:1]
+        panel._simulate()()
+        assert target.particles[3].n_rows == target.particles[2].n_rows - sizes.pop(len(given))
+        assert {body: len(rows) for body, rows in simulation.bodies(4).items()} == sizes
+        said = ["- frame 1: duplicate moving", f"- frame 2: remove body {len(given) + 1}"]
+        assert panel._edits.content.splitlines() == said
         panel._middle.value = (90.0, 90.0, 90.0)
         with pytest.raises(InputError, match="the selection is empty"):
-            panel._simulate()
+            panel._simulate()()
 
 
 def test_panel_shows_what_effects_cost(viser, simulation):
     with server.Viewer(simulation.target, simulation) as viewer:
         viewer.timeline.seek(4)
-        viewer._panel._measure()
+        viewer._panel._measure()()
         lines = viewer._panel._costs.content.splitlines()
         assert lines[0] == "| effect | setting | ms a step |" and any("| history | 2 steps (on) |" in x for x in lines)
         assert not viewer._panel._progress.visible
