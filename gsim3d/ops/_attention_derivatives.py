@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from gsim3d.ops._arguments import widened
 from gsim3d.ops._register import call
 
 
@@ -73,14 +74,10 @@ def _flat(x: Tensor) -> Tensor:
     return x.reshape(x.shape[0], x.shape[1] * x.shape[2])
 
 
-def _wide(*tensors: Tensor | None) -> list[Tensor | None]:
-    return [x.float() if x is not None and x.dtype in (torch.float16, torch.bfloat16) else x for x in tensors]
-
-
 def tangent(q, k, v, by_q, by_k, by_v, lists, scale: float) -> Tensor:
     """O' [Nq, H, D] along a direction (by_q, by_k, by_v), of which some may be None."""
     dtype = q.dtype
-    q, k, v, by_q, by_k, by_v = _wide(q, k, v, by_q, by_k, by_v)
+    q, k, v, by_q, by_k, by_v = (x if x is None else widened(x) for x in (q, k, v, by_q, by_k, by_v))
     patches = Patches(lists, q.shape[0], k.shape[0])
     q, k, v = patches.of_queries(q), patches.of_keys(k), patches.of_keys(v)
     weights = patches.softmax(scale * q @ k.mT)
@@ -98,7 +95,7 @@ def tangent(q, k, v, by_q, by_k, by_v, lists, scale: float) -> Tensor:
 def gradients_of_gradients(grad, q, k, v, by_q, by_k, by_v, lists, scale: float) -> tuple[Tensor, ...]:
     """The gradients of <dQ, by_q> + <dK, by_k> + <dV, by_v> with respect to grad, q, k and v."""
     dtype = q.dtype
-    grad, q, k, v, by_q, by_k, by_v = _wide(grad, q, k, v, by_q, by_k, by_v)
+    grad, q, k, v, by_q, by_k, by_v = map(widened, (grad, q, k, v, by_q, by_k, by_v))
     patches = Patches(lists, q.shape[0], k.shape[0])
     grad, q, by_q = map(patches.of_queries, (grad, q, by_q))
     k, v, by_k, by_v = map(patches.of_keys, (k, v, by_k, by_v))

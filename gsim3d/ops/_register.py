@@ -6,6 +6,7 @@ What it does not have ends with a :class:`gsim3d.GradientError`, never with None
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -18,6 +19,9 @@ from gsim3d.ops import _load  # noqa: F401
 
 _library = torch.library.Library("gsim3d", "FRAGMENT")
 _functions: dict[str, tuple[type[torch.autograd.Function], dict[str, int]]] = {}  # and places without a gradient
+_casts: dict[str, Callable[[str, Sequence[Any]], Sequence[Any]]] = {}  # rules of autocast
+_no_autocast = torch._C.DispatchKeySet(torch._C.DispatchKey.AutocastCPU)
+_no_autocast = _no_autocast | torch._C.DispatchKeySet(torch._C.DispatchKey.AutocastCUDA)
 
 
 def fakes(**functions: Callable) -> None:
@@ -59,6 +63,7 @@ def register_gradients(
         batched: (size, inputs, is_batched) -> outputs with the batch in front, of inputs that have it in front where
             ``is_batched``; :func:`call` then has ``torch.func``.
     """
+    backward = _without_autocast(backward)
     _register(op, op, Info(backward, setup), without)
     if batched is not None:
         names = [argument.name for argument in getattr(torch.ops.gsim3d, op).default._schema.arguments]
@@ -74,7 +79,9 @@ def call(op: str, *arguments: Any) -> Any:
     if transformed and op in _functions and not torch.compiler.is_compiling():
         function, without = _functions[op]
         refuse(op, {name: arguments[k] for name, k in without.items()})
-        return function.apply(*arguments)
+        if op in _casts and (device := arguments[0].device.type) != "meta" and torch.is_autocast_enabled(device):
+            arguments = tuple(_casts[op](device, arguments))  # rules of gradients see what is computed with
+        return _without_autocast(function.apply)(*arguments)
     return getattr(torch.ops.gsim3d, op)(*arguments)
 
 
@@ -138,27 +145,23 @@ def register_autocast(op: str, rule: str | Callable[[str, Sequence[Any]], Sequen
     """What gsim3d::``op`` computes in under ``torch.autocast``: "float32"; "follow": the same on the CPU, and
     autocast's dtype on CUDA (float64 stays, as in torch); or by a function (device, arguments) -> arguments."""
     overload = getattr(torch.ops.gsim3d, op).default
+    _casts[op] = cast = partial(_cast, rule) if isinstance(rule, str) else rule
     for device in ("cpu", "cuda"):
-        if rule == "float32" or (rule == "follow" and device == "cpu"):
-            torch.library.register_autocast(f"gsim3d::{op}", device, torch.float32)
-            continue
-        _library.impl(op, _cast(overload, device, _follow if rule == "follow" else rule), f"Autocast{device.upper()}")
+        kernel = _without_autocast(lambda *arguments, device=device: overload(*cast(device, arguments)))
+        _library.impl(op, kernel, f"Autocast{device.upper()}")
 
 
-def _cast(overload: Callable, device: str, rule: Callable) -> Callable:
-    keys = torch._C.DispatchKeySet(getattr(torch._C.DispatchKey, f"Autocast{device.upper()}"))
-
-    def kernel(*arguments):
-        arguments = rule(device, arguments)
-        with torch._C._ExcludeDispatchKeyGuard(keys):
-            return overload(*arguments)
-
-    return kernel
-
-
-def _follow(device: str, arguments: Sequence[Any]) -> list[Any]:
-    dtype = torch.get_autocast_dtype(device)
+def _cast(rule: str, device: str, arguments: Sequence[Any]) -> list[Any]:
+    dtype = torch.get_autocast_dtype(device) if (rule, device) == ("follow", "cuda") else torch.float32
     return [x.to(dtype) if is_narrow(x) else x for x in arguments]
+
+
+def _without_autocast(function: Callable) -> Callable:
+    def run(*arguments):
+        with torch._C._ExcludeDispatchKeyGuard(_no_autocast):
+            return function(*arguments)
+
+    return run
 
 
 def is_narrow(x: Any) -> bool:

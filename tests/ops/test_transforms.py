@@ -103,3 +103,39 @@ def test_hessian_by_reverse_over_reverse(function, inputs):
     ours = torch.func.jacrev(torch.func.jacrev(loss))(inputs[0])
     expected = torch.autograd.functional.hessian(loss, inputs[0])
     torch.testing.assert_close(ours, expected)
+
+
+@EVERY_OP
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
+def test_transforms_under_autocast(function, inputs, dtype):
+    def loss(*xs):
+        return function(*xs).float().pow(2).sum()
+
+    inputs = [x.to(dtype) for x in inputs]
+    arguments, directions = tuple(range(len(inputs))), tuple(torch.cos(9 * x) for x in inputs)
+    wide = [[x.float() for x in group] for group in (inputs, directions)]
+    expected, moved = torch.func.jvp(loss, *map(tuple, wide))
+    with torch.autocast("cpu", torch.bfloat16):
+        xs = leaves(inputs)
+        eager = torch.autograd.grad(loss(*xs), xs)
+        ours = torch.func.grad(loss, arguments)(*inputs)
+        each = torch.func.vmap(torch.func.grad(loss, arguments))(*(x[None] for x in inputs))
+        results = torch.func.jvp(loss, tuple(inputs), directions)
+    for got, batched, e in zip(ours, each, eager, strict=True):
+        torch.testing.assert_close(got, e)
+        torch.testing.assert_close(batched[0], e)
+    torch.testing.assert_close(results, (expected, moved))  # computed in float32
+
+
+def test_second_derivatives_of_attention_under_autocast_are_computed_in_float32():
+    function, inputs = CALLS["patch_attention"]
+
+    def second():
+        xs = leaves([x.float() for x in inputs])
+        grads = torch.autograd.grad(function(*xs).pow(2).sum(), xs, create_graph=True)
+        return torch.autograd.grad(sum(g.sum() for g in grads), xs)
+
+    expected = second()
+    with torch.autocast("cpu", torch.bfloat16):
+        for got, e in zip(second(), expected, strict=True):
+            torch.testing.assert_close(got, e)
