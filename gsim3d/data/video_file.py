@@ -31,27 +31,28 @@ class Video:
         times: float64 [N], seconds.
         rate: frames per second; None if frames are not evenly spaced.
         note: remark about dropped frames; "" if there are none.
+        is_still: whether all frames show the same picture.
     """
 
     def __init__(self, file: Path, name: str, size: tuple[int, int], problems: Problems):
         self.what, self._file, self._size = f"video {file} (camera {name})", file, size
-        self.numbers, self.times, self.rate, self.note = [], np.zeros(0), None, ""
+        self.numbers, self.times, self.rate, self.note, self.is_still = [], np.zeros(0), None, "", False
         try:
             stat = file.stat()
-            found = _scan(file, size, (stat.st_mtime_ns, stat.st_size))
+            times, header, self.is_still = _scan(file, size, (stat.st_mtime_ns, stat.st_size))
         except (InputError, OSError) as error:
             problems.add(f"{self.what} {error if isinstance(error, InputError) else error.strerror}")
             return
-        cut, self.rate = _even_part(found.times, found.rate)
-        self.times = found.times[: len(found.times) - cut]
+        cut, self.rate = _even_part(times, header)
+        self.times = times[: len(times) - cut]
         self.numbers = list(range(len(self.times)))
         if cut:
-            self.note = f"{self.what}: the last {cut} of {len(found.times)} frames are isolated and are dropped"
+            self.note = f"{self.what}: the last {cut} of {len(times)} frames are isolated and are dropped"
         if self.rate is None:
-            gaps = (1000 * np.diff(found.times)).round(1)
+            gaps = (1000 * np.diff(times)).round(1)
             self.unevenness = (
-                f"its {len(found.times)} frames are {gaps.min():g} to {gaps.max():g} ms apart, but its header gives "
-                f"{found.rate:.4g} fps"
+                f"its {len(times)} frames are {gaps.min():g} to {gaps.max():g} ms apart, but its header gives "
+                f"{header:.4g} fps"
             )
 
     def read(self, numbers: Sequence[int], problems: Problems) -> Iterator[np.ndarray | None]:
@@ -73,17 +74,10 @@ class Video:
             capture.release()
 
 
-@dataclass(frozen=True)
-class _Scan:
-    """Result of decoding a file."""
-
-    times: np.ndarray  #: float64 [N] seconds, of all decodable frames
-    rate: float  #: frames per second in the header; may be invalid
-
-
 @lru_cache(maxsize=10_000)
-def _scan(file: Path, size: tuple[int, int], stamp: tuple) -> _Scan:
-    """Decodes a file once for the times of its frames; ``stamp`` is part of the key, errors do not name the file."""
+def _scan(file: Path, size: tuple[int, int], stamp: tuple) -> tuple[np.ndarray, float, bool]:
+    """Decodes a file once: returns the times of all decodable frames, float64 [N] seconds, the header's frame rate,
+    which may be invalid, and ``is_still``. ``stamp`` is part of the key; errors do not name the file."""
     index = _index(file)
     capture = open_video(file)
     try:
@@ -96,8 +90,11 @@ def _scan(file: Path, size: tuple[int, int], stamp: tuple) -> _Scan:
         if found != size:
             turned = f" (rotated by {turn:g} degrees by its display matrix)" if turn else ""
             raise InputError(f"has {found[0]}x{found[1]} pixels{turned}, its camera {size[0]}x{size[1]}")
-        times, marks = [], []
+        times, marks, pictures = [], [], []
         while capture.grab():
+            if len(pictures) < 2 and len(times) & (len(times) - 1) <= 0:  # frames 0, 1, 2, 4, 8 ...
+                picture = capture.retrieve()[1]
+                pictures += [picture] if not pictures or not np.array_equal(picture, pictures[0]) else []
             times.append(capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
             marks.append(capture.get(cv2.CAP_PROP_PTS))
             if len(times) > MAX_STEPS:
@@ -119,7 +116,7 @@ def _scan(file: Path, size: tuple[int, int], stamp: tuple) -> _Scan:
                 f"cannot be decoded to its end: {times[-1] + gap:.4g} of {index.duration:.4g} s, {len(times)} of "
                 f"{count:g} frames; it is damaged"
             )
-    return _Scan(times, rate)
+    return times, rate, len(pictures) == 1 < len(times)
 
 
 def open_video(file: Path, what: str = ""):

@@ -217,6 +217,9 @@ def _steps(
         fps = 1.0
     notes = [video.note for video in videos.values() if video.note]
     for video in videos.values():
+        if video.is_still:
+            how = "it is interlaced, which OpenCV 5 cannot decode (convert it, as by ffmpeg -vf yadif)"
+            problems.add(f"{video.what} shows the same picture in all frames: nothing moves in it, or {how}")
         if video.rate is None and resample is None:
             hint = f'set "resample" (steps per second) in {source.name}'
             problems.add(f"{video.what} is uneven: {video.unevenness}; {hint}")

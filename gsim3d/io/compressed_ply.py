@@ -125,7 +125,7 @@ def _sorted(splats: Splats) -> Splats:
     low, high = splats.means.min(0, initial=np.inf), splats.means.max(0, initial=-np.inf)
     span = np.maximum(high - low, np.finfo(np.float32).tiny)
     code = np.zeros(splats.count, np.uint64)
-    cells = unorm((splats.means - low) / span, 10).astype(np.uint64) if splats.count else np.zeros((0, 3), np.uint64)
+    cells = unorm((splats.means - low) / span, 10).astype(np.uint64)
     for bit in range(10):
         for axis in range(3):
             code |= ((cells[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)

@@ -1,6 +1,7 @@
 """Videos by the times in them: variable rates, edit lists, late starts, longer sound, turned, without a duration."""
 
 import os
+import re
 from pathlib import Path
 
 import cv2
@@ -185,6 +186,23 @@ def test_videos_of_different_rates_are_refused(tmp_path):
             Scene.open(write_scene(tmp_path, ["a", "b"], **keys))
     scene = Scene.open(write_scene(tmp_path, ["a", "b"], resample=10))
     assert scene.fps == 10 and frames_of(scene) == [list(range(0, 20, 2)), [number % 20 for number in range(0, 30, 3)]]
+
+
+@pytest.mark.parametrize("name, codec", [("a.mp4", "mpeg4"), ("a.mkv", "mpeg2video"), ("a.mov", "libx264")])
+def test_interlaced_videos_are_read_or_refused(tmp_path, name, codec):
+    """OpenCV 5 gives the same picture of whatever its memory held for each of their frames, without an error."""
+    av = pytest.importorskip("av")
+    with av.open(str(tmp_path / name), "w") as file:
+        film = file.add_stream(codec, rate=RATE, options={"flags": "+ilme+ildct", "x264-params": "interlaced=1"})
+        film.width, film.height, film.pix_fmt = 64, 48, "yuv420p"
+        for frame in range(N_FRAMES):
+            picture = np.full((48, 64, 3), 12 * frame, np.uint8)
+            file.mux(film.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        file.mux(film.encode())
+    try:
+        assert frames_of(Scene.open(write_scene(tmp_path, ["a"]))) == [list(range(N_FRAMES))]
+    except InputError as error:
+        assert re.search("same picture in all frames: .* or it is interlaced", str(error))
 
 
 def test_fps_replaces_the_rate_of_even_videos(tmp_path):
