@@ -78,6 +78,8 @@ FRAMES = [
     ("cameras.viewmats", entry((1, 0, 3), 1e12), NumericalError, "viewmats must be at most"),
     ("cameras.viewmats", entry((1, slice(0, 3), slice(0, 3)), 0.0), NumericalError, "viewmats must be a rotation"),
     ("cameras.viewmats", lambda x: 2 * x, NumericalError, "viewmats must be a rotation"),
+    ("cameras.viewmats", lambda x: x * torch.tensor([[-1.0], [1], [1], [1]]), NumericalError, "right-handed"),
+    ("cameras.viewmats", lambda x: x[:, [1, 0, 2, 3]], NumericalError, "right-handed"),
     ("cameras.viewmats", entry((1, 3, 0), 1.0), NumericalError, "viewmats must be a rotation"),
 ]
 

@@ -97,12 +97,12 @@ def _wanted(frames: Frames) -> list[_Wanted]:
     error = (rotation @ rotation.mT - torch.eye(3, dtype=rotation.dtype, device=rotation.device)).abs().amax((1, 2))
     focal = torch.stack([Ks[:, 0, 0], Ks[:, 1, 1]], 1)
     lower = torch.stack([Ks[:, 1, 0], Ks[:, 2, 0], Ks[:, 2, 1], Ks[:, 2, 2] - 1], 1).abs().amax(1)
-    is_pose = (error <= ROTATION_ERROR) & ((viewmats[:, 3] - last).abs().amax(1) <= 1e-5)
+    is_right_handed = (torch.linalg.cross(rotation[:, 0], rotation[:, 1]) * rotation[:, 2]).sum(1) > 0
+    is_pose = is_right_handed & (error <= ROTATION_ERROR) & ((viewmats[:, 3] - last).abs().amax(1) <= 1e-5)
     is_K = at_most(Ks, MAX_PIXELS) & (focal.amin(1) >= 1 / MAX_PIXELS) & (lower <= 1e-5)
     of_focal = f"from {1 / MAX_PIXELS:g} to {MAX_PIXELS:g}"
     offset = origin if frames.world_offset is None else frames.world_offset
     finite, size = "must be finite", f"must be at most {FARTHEST:g} m in size"
-    in_range = (near >= NEAREST) & (near <= FARTHEST), (far >= NEAREST) & (far <= FARTHEST)
     bounds = f"must be from {NEAREST:g} to {FARTHEST:g} m"
     return [
         _Wanted("cameras.image_cloud", (shows >= 0) & (shows < n_clouds), f"must be in [0, {n_clouds}), the clouds"),
@@ -112,13 +112,13 @@ def _wanted(frames: Frames) -> list[_Wanted]:
         _Wanted("world_offset", at_most(offset, FARTHEST), f"{finite} and at most {FARTHEST:g} m in size", "scene"),
         _Wanted("cameras.viewmats", viewmats.flatten(1).isfinite().all(1), finite),
         _Wanted("cameras.viewmats", at_most(viewmats, FARTHEST), size, advice=NEARER),
-        _Wanted("cameras.viewmats", is_pose, "must be a rotation and a translation"),
+        _Wanted("cameras.viewmats", is_pose, "must be a rotation, right-handed, and a translation"),
         _Wanted("cameras.Ks", Ks.flatten(1).isfinite().all(1), finite),
         _Wanted("cameras.Ks", is_K, f"must be [[fx, skew, cx], [0, fy, cy], [0, 0, 1]], fx and fy {of_focal}"),
         _Wanted("cameras.near", near > 0, "must be positive"),
         _Wanted("cameras.far", (far > near) & far.isfinite(), "must be finite and larger than near"),
-        _Wanted("cameras.near", in_range[0], bounds),
-        _Wanted("cameras.far", in_range[1], bounds),
+        _Wanted("cameras.near", (near >= NEAREST) & (near <= FARTHEST), bounds),
+        _Wanted("cameras.far", (far >= NEAREST) & (far <= FARTHEST), bounds),
     ]
 
 
