@@ -260,6 +260,18 @@ def test_opcheck(device, covars):
     torch.library.opcheck(torch.ops.gsim3d.project_gaussians, args)
 
 
+@pytest.mark.parametrize("wanted", [(False, False), (True, False), (False, True)], ids=str)
+def test_opcheck_of_the_gradient(device, wanted):
+    case = Case("opencv", n=8, device=device)
+    seen = case.project()
+    means, quats, scales, viewmats, Ks, distortion = case.leaves
+    lists = [x.to(device) for x in (case.image_cloud, case.cu_rows)]
+    scene = (seen.radii, means, quats, scales, None, viewmats, Ks, distortion, *lists, seen.cu_pairs)
+    args = (*pairs_of(seen), *scene, case.n_pairs, 45, 37, 0.3, 2, False, *wanted)
+    checks = ("test_schema", "test_faketensor")
+    torch.library.opcheck(torch.ops.gsim3d.project_gaussians_backward, args, test_utils=checks)
+
+
 def test_opcheck_sh(device):
     args = [torch.randn(2, 3, 4, size, dtype=torch.float64, device=device) for size in (3, 5)]
     args[1] = args[1].movedim(1, 2)[:, :, :1].repeat(1, 1, 9, 1).contiguous()
@@ -323,6 +335,22 @@ def test_points_beyond_the_monotone_radius_are_left_out(device, lens, k):
     covars = 0.01 * torch.eye(3, device=device, dtype=torch.float64).repeat(2, 1, 1)
     seen = project_gaussians(means, None, None, cameras, covars=covars, lens=lens, distortion=k)
     assert (seen.radii > 0).all(1).tolist() == [True, False]
+
+
+@pytest.mark.parametrize(("lens", "n"), [("opencv", 4), ("opencv", 5), ("opencv", 8), ("fisheye", 4)])
+def test_limits_against_a_fine_scan(lens, n):
+    k = torch.randn(30, n, generator=torch.Generator().manual_seed(n), dtype=torch.float64)
+    angles = torch.linspace(0, math.pi if lens == "fisheye" else math.pi / 2 - 1e-2, 100_001, dtype=torch.float64)
+    r = angles if lens == "fisheye" else angles.tan()
+    c = torch.nn.functional.pad(k, (0, 8 - n))[..., None].unbind(1)
+    up, down = (c[:4], ()) if lens == "fisheye" else ((c[0], c[1], c[4]), c[5:])
+    above, below = (1 + sum(c[i] * r ** (2 * i + 2) for i in range(len(c))) for c in (up, down))
+    falls = torch.nn.functional.pad((r * above / below).diff(dim=1) <= 0, (0, 1)) | torch.as_tensor(below <= 0)
+    expected = torch.where(falls.any(1), angles[falls.int().argmax(1)], math.inf)
+    limits = lens_limits(lens, k)
+    assert 5 < falls.any(1).sum() and torch.equal(limits.isinf(), expected.isinf())
+    found = limits if lens == "fisheye" else limits.atan()
+    assert (found - expected)[limits.isfinite()].abs().max() < 1e-4
 
 
 def test_lenses_without_a_fold_have_no_limit():
@@ -434,6 +462,10 @@ def test_errors_name_the_argument():
         call(covars=torch.eye(3).repeat(40, 1, 1).double())
     with pytest.raises(ValueError, match="give quats and scales, or covars"):
         call(scales=None)
+    with pytest.raises(ValueError, match="give quats and scales, or covars"):
+        call(scales=None, covars=torch.eye(3).repeat(40, 1, 1).double())
+    with pytest.raises(ValueError, match="image_cloud must be int64"):
+        call(cameras=dataclasses.replace(cameras, image_cloud=cameras.image_cloud.int()))
     with pytest.raises(ValueError, match="lens must be one of pinhole"):
         call(lens="ftheta")
     with pytest.raises(ValueError, match="distortion is of the lenses"):
