@@ -9,9 +9,13 @@ import pytest
 import torch
 
 from gsim3d.cameras import Cameras
+from gsim3d.io import read_splats
 from gsim3d.math.rotations import rotation_matrices
+from gsim3d.numerics.trust import Trust
 from gsim3d.ops import rasterize_gaussians
+from gsim3d.train.restore import restore
 from gsim3d.viewer import server
+from gsim3d.viewer.simulation import Simulation
 from tests.viewer.browser import Browser, chromium
 from tests.viewer.test_live import RED, splats, target_of
 from tests.viewer.test_player import make
@@ -22,6 +26,13 @@ pytestmark = [
 ]
 WIDTH, HEIGHT = 1000, 600
 FREE = slice(320, 660)  # columns that neither panel nor notices cover
+LABEL = "[...document.querySelectorAll('label')].find(one => one.textContent === '{}')"
+FIELD = f"{LABEL}.parentElement.parentElement.parentElement.querySelector('input, textarea')"
+LEAF = "[...document.querySelectorAll('{}')].find(one => one.textContent === '{}')"
+TYPED = """(field => {{
+  Object.getOwnPropertyDescriptor(Object.getPrototypeOf(field), 'value').set.call(field, '{}');
+  field.dispatchEvent(new Event('input', {{bubbles: true}}));
+}})({})"""
 BUTTON = "[...document.querySelectorAll('button')].find(button => button.textContent === '{}')"
 # viser 1.1.1 draws splats as a quad whose corners have two coordinates; three.js misses the third where it culls.
 BENIGN = "computeBoundingSphere(): Computed radius is NaN"
@@ -134,4 +145,37 @@ def test_a_click_in_the_browser_chooses_the_body_under_it(simulation):
         until(lambda: viewer._panel._inside.value, 20)
         middle, half = np.array(viewer._panel._middle.value), np.array(viewer._panel._sides.value) / 2
         assert viewer._panel._which.value.startswith("body ") and (np.abs(point.numpy() - middle) < half).all()
+        assert not [text for text in browser.complaints if BENIGN not in text]
+
+
+def test_trust_is_seen_and_usd_written_from_the_browser(checkpoint, scene, tmp_path):
+    pytest.importorskip("pxr", reason="needs usd-core")
+    restored = restore(checkpoint)
+    restored.simulator.trust = Trust(2, 3, 0.5, 1.0, (-9.0, 0.0), (0.9,), ((0.01, 0.1),), {}, 3.0)
+    simulation = Simulation(restored, restored.open_scene(scene), 3)
+    target = simulation.target
+    with server.Viewer(target, simulation) as viewer, Browser(WIDTH, HEIGHT) as browser:
+        browser.open(viewer.address)
+        until(lambda: (shot(browser)[:, FREE].min(-1) < 0.9).mean() > 0.01)
+        viewer.timeline.seek(4)
+        viewer.draw()
+        browser.value(f"{FIELD.format('Colours')}.click()")
+        browser.wait(f"Boolean({LEAF.format('[role=option]', 'trust')})", 20)
+        browser.value(f"{LEAF.format('[role=option]', 'trust')}.click()")
+        until(lambda: viewer.layers.coloring == "trust", 60)
+        worst = target.colors(4, "trust").unique(dim=0)
+        assert len(worst) > 2
+        until(lambda: (np.abs(shot(browser)[:, FREE, 0] - shot(browser)[:, FREE, 2]) > 0.3).mean() > 0.005, 20)
+        browser.value(f"{LEAF.format('p,span,div', 'Export')}.click()")
+        for name in ("seen.usda", "seen.usdc"):
+            file = tmp_path / name
+            browser.wait(f"Boolean({BUTTON.format('Write what is seen')})", 20)
+            browser.value(TYPED.format(file, FIELD.format("File")))
+            time.sleep(0.5)
+            browser.value(f"{BUTTON.format('Write what is seen')}.click()")
+            until(file.is_file, 30)
+            seen, read = target.seen(4, viewer.layers), read_splats(file)
+            order = [one.means[:, 0].argsort() for one in (seen, read)]
+            torch.testing.assert_close(read.means[order[1]], seen.means[order[0]])
+            torch.testing.assert_close(read.sh[order[1], 0], seen.sh[order[0], 0])
         assert not [text for text in browser.complaints if BENIGN not in text]
