@@ -39,10 +39,9 @@ def with_bodies(state: Particles) -> Particles:
             near = votes.argmax(1)[pieces[step]]
         numbers[step] = near
     order = torch.bincount(numbers[len(clouds) - 1], minlength=typical).argsort(descending=True).argsort()
-    labels = [torch.full((cloud.n_rows,), -1) for cloud in clouds]
-    for step, mine in enumerate(rows):
-        labels[step][mine] = order[numbers[step]]
-    return dataclasses.replace(state, label=torch.cat(labels).to(state.means.device))
+    label = torch.full((state.n_rows,), -1)
+    label[state.activity.cpu() != FROZEN] = order[torch.cat([numbers[step] for step in range(len(clouds))])]
+    return dataclasses.replace(state, label=label.to(state.means.device))
 
 
 def with_copies(state: Particles, counts: Sequence[int]) -> Particles:

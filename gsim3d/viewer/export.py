@@ -27,6 +27,7 @@ def write_frames(
     up: str | None = None,
     size: int = 512,
     turns: float | None = None,
+    start: int = 0,
 ) -> str:
     """Writes the file ``to``, whose suffix is its format; returns one line about what was written.
 
@@ -36,6 +37,7 @@ def write_frames(
         up: "y" or "z", the axis that points up in ``to``; None: as its format says.
         size: pixels, width and height of a video.
         turns: turns of a video's camera around the scene; None: a quarter, one around a single frame.
+        start: number of the first predicted frame, of a player.
     Raises:
         InputError: ``to`` cannot hold it.
     """
@@ -46,8 +48,7 @@ def write_frames(
         write_video(out, _orbit(list(frames), fps, size, turns), fps)
         what = f"a video of {size}x{size} pixels"
     elif suffix == ".html":
-        gaussians = list(frames)
-        write_player(out, gaussians, fps=fps, title=out.stem)
+        write_player(out, gaussians := list(frames), fps=fps, title=out.stem, start=start)
         what = f"{max(one.means.shape[0] for one in gaussians):,} Gaussians for any browser"
     else:
         suffix, kind = format_of(out, (".mp4", ".html"))
@@ -66,8 +67,8 @@ def write_frames(
 def _orbit(frames: list[Gaussians], fps: float, size: int, turns: float | None) -> Iterator[np.ndarray]:
     """Images of ``frames`` with their time, or of a single one from all sides."""
     if len(frames) == 1:
-        frames = frames * max(2, round(ORBIT * fps))
-        yield from orbit_frames(frames, len(frames), size, 1.0 if turns is None else turns)
+        count = max(2, round(ORBIT * fps))
+        yield from orbit_frames(frames * count, count, size, 1.0 if turns is None else turns)
         return
     for step, image in enumerate(orbit_frames(frames, len(frames), size, 0.25 if turns is None else turns)):
         write_time(image, step, fps)

@@ -272,8 +272,8 @@ class Target:
         """
         if self.gaussians(0) is None:
             raise InputError(f"{self.name} holds no Gaussians that could be written to {path}")
-        seen = (self.seen(frame, layers) for frame in frames)
-        return write_frames(path, (one for one in seen if one is not None), len(frames), fps=self.fps)
+        seen, n_given = (self.seen(frame, layers) for frame in frames), sum(one < self.n_encoded for one in frames)
+        return write_frames(path, seen, len(frames), fps=self.fps, start=n_given)
 
     def views(self, frame: int, cams: Sequence[int]) -> list[View]:
         """Cameras ``cams`` of the scene at a frame."""

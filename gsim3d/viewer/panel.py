@@ -154,12 +154,11 @@ class SimulationPanel:
         return partial(self._measured, self._viewer.timeline.frame)
 
     def _measured(self, frame: int) -> None:
-        bar = self._progress
+        bar, now = self._progress, {switch.name: switch.now for switch in self._simulation.switches()}
         bar.visible = True
         try:
             found = self._simulation.costs(frame, lambda share: setattr(bar, "value", 100 * share))
         finally:
             bar.visible = False
-        now = {switch.name: switch.now for switch in self._simulation.switches()}
         rows = [f"| {n} | {label}{' (on)' if now[n] == label else ''} | {ms:.1f} |" for n, label, ms in found]
         self._costs.content = "\n".join(["| effect | setting | ms a step |", "|:--|:--|--:|", *rows])

@@ -300,7 +300,7 @@ async function main() {
     if (seek) clock = frame;
     $("scrub").value = frame;
     $("time").textContent = `${(frame / fps).toFixed(2)} s / ${((frames - 1) / fps).toFixed(2)} s`;
-    $("label").textContent = frame < header.start ? "given" : "predicted";
+    $("label").textContent = frame < header.start ? "given" : header.start || header.truth.length ? "predicted" : "";
     changed = true;
   }
   function play(on) {

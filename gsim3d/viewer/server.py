@@ -29,6 +29,7 @@ from gsim3d.viewer.simulation import Simulation
 LOCAL, PUBLIC = "127.0.0.1", "0.0.0.0"
 MOST_CAMERAS = 16  # of a scene that are drawn, spread evenly
 TICK = 1 / 60  # seconds between looks at the clock
+LEGEND = "velocity, trust: from blue, the least, to red; activity: orange is awake, blue asleep, grey frozen"
 EXPORT = "on the machine of the server; must not exist yet. .ply, .splat, .spz, .glb, .usdc, .html, .mp4, ..."
 
 
@@ -194,7 +195,7 @@ class Viewer:
                 box = gui.add_checkbox(name, True)
                 self.on(box, partial(self._change_layer, name, box))
             if target.gaussians(0) is not None:
-                self._coloring = coloring = gui.add_dropdown("Colours", target.colorings)
+                self._coloring = coloring = gui.add_dropdown("Colours", target.colorings, hint=LEGEND)
                 size = gui.add_slider("Size", *SIZES, 0.05, 1.0, hint="of the drawn Gaussians")
                 self.on(coloring, partial(self._change_layer, "coloring", coloring))
                 self.on(size, partial(self._change_layer, "size", size))

@@ -177,6 +177,16 @@ def test_write_player_refuses_unusable_input(given, says, tmp_path):
 
 
 @browsing
+def test_player_of_a_file_does_not_call_it_predicted(tmp_path):
+    write_player(tmp_path / "a.html", moving(2), fps=FPS)
+    with Browser(SIZE, SIZE + 110) as browser:
+        browser.open((tmp_path / "a.html").as_uri())
+        browser.wait("globalThis.player && player.painted !== null")
+        label = "document.getElementById('label')"
+        assert browser.value(f"{label}.textContent === '' && getComputedStyle({label}).display === 'none'")
+
+
+@browsing
 def test_player_in_browser_equals_rasterizer(tmp_path):
     frames, seen = moving(10, degree=3), view()
     truth = [(rendered(frame, seen) * 255).byte().numpy() for frame in frames]

@@ -25,6 +25,7 @@ from gsim3d.viewer.targets import open_state, open_target
 from tests.effects.models import EXPLICIT_CONFIG
 from tests.test_simulator import SIZE, awake, make_simulator
 from tests.viewer.test_live import falling, splats
+from tests.viewer.test_player import unpacked
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -403,6 +404,12 @@ def test_folders_of_every_format_are_opened(suffix, tmp_path):
     target = open_target(tmp_path)
     assert target.n_frames == 4 and target.seen(3, Layers()).means[:, 2].min() == pytest.approx(-0.3, abs=1e-2)
     assert open_target(tmp_path / f"step_2{suffix}").n_frames == 1
+
+
+def test_players_of_what_is_seen_label_the_given_frames(simulation, tmp_path):
+    for name, frames, start in (("all.html", range(5), 2), ("given.html", [1], 1), ("later.html", [3], 0)):
+        simulation.target.export(tmp_path / name, frames, Layers())
+        assert unpacked((tmp_path / name).read_text())[0]["start"] == start
 
 
 @pytest.mark.parametrize("name, frames", [("all.html", 5), ("all.mp4", 5), ("one.splat", 1)])
