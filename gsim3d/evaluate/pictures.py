@@ -18,7 +18,7 @@ from gsim3d.errors import InputError
 from gsim3d.evaluate.protocol import Prediction, render_steps
 from gsim3d.evaluate.scoring import METRICS
 from gsim3d.io import write_ply, write_video
-from gsim3d.io.files import whole_file, write_picture
+from gsim3d.io.files import new_output_path, whole_file, write_picture
 from gsim3d.io.particles import STATE, write_particles
 from gsim3d.io.sequence import write_about
 from gsim3d.io.terminal import progress
@@ -92,8 +92,7 @@ def write_prediction(
     steps = progress(steps, "rendering", unit="step", quiet=quiet)
     images = [as_bytes(render_steps(restored, step, scene, cams, first + i))[0] for i, step in enumerate(steps)]
     truth = true_images(scene, cams, range(first, first + len(images)))
-    part = folder.with_name(f".{folder.name}.part")
-    shutil.rmtree(part, ignore_errors=True)
+    part = folder.with_name(f".{folder.name}.{os.getpid()}.part")  # another call may write to the same folder
     try:
         (part / "frames").mkdir(parents=True)
         for step, views in enumerate(images):
@@ -117,7 +116,7 @@ def write_prediction(
                 truth=truth[:, 0],
                 start=prediction.n_encoded,
             )
-        os.replace(part, folder)
+        os.replace(part, new_output_path(folder))
     finally:
         shutil.rmtree(part, ignore_errors=True)
 

@@ -15,8 +15,8 @@ from gsim3d.data import Scene
 from gsim3d.dynamics import concatenate
 from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError
-from gsim3d.evaluate import protocol
-from gsim3d.evaluate.pictures import splat_picture, true_images, write_curves
+from gsim3d.evaluate import pictures, protocol
+from gsim3d.evaluate.pictures import splat_picture, true_images, write_curves, write_prediction
 from gsim3d.evaluate.protocol import (
     METHODS,
     Prediction,
@@ -76,6 +76,22 @@ def test_scenes_predicted_together_are_those_predicted_alone(restored, scene, tm
         for method, metrics in scores[0].items():
             for metric, values in metrics.items():
                 torch.testing.assert_close(values, scores[1][method][metric], rtol=1e-3, atol=1e-3, equal_nan=True)
+
+
+def test_predictions_of_two_calls_are_not_mixed(restored, scene, tmp_path, monkeypatch):
+    """The call that ends last is refused; what the other one has written stays as it is."""
+    prediction, write_film = predict(restored, scene, (0, 2), 1), pictures.write_video
+    other = tmp_path / ".out.part" / "frames"
+    other.mkdir(parents=True)
+
+    def while_another_ends(*arguments):
+        write_film(*arguments)
+        shutil.copytree(other.parent, tmp_path / "out")
+
+    monkeypatch.setattr(pictures, "write_video", while_another_ends)
+    with pytest.raises(InputError, match="out exists already"):
+        write_prediction(tmp_path / "out", restored, scene, prediction, [3], 0, quiet=True)
+    assert sorted(path.name for path in tmp_path.rglob("*")) == [".out.part", "frames", "frames", "out"]
 
 
 def test_views_that_are_named(restored, scene):
