@@ -231,6 +231,14 @@ def test_no_rows_show_the_background(device):
     assert_same_bits(color, rows[5].expand(1, HEIGHT, WIDTH, -1).contiguous())
 
 
+def test_one_image_is_the_default(device):
+    (*rows, _), _ = random_rows(device=device)
+    size, white = {"width": WIDTH, "height": HEIGHT}, torch.ones(1, 5, dtype=torch.float64, device=device)
+    expected = rasterize_projected(*rows, **size, cu_pairs=torch.tensor([0, 60], device=device), background=white)
+    for background in (white, white[0]):
+        assert_same_bits(rasterize_projected(*rows, **size, background=background).color, expected.color)
+
+
 def test_half_precision_colors(device):
     rows, cu_pairs = random_rows(dtype=torch.float32, device=device)
     rows[4] = rows[4].half()
@@ -258,8 +266,9 @@ def test_errors_name_the_argument():
         rasterize_projected(*first, colors, background=background[:, :2], **size)
     with pytest.raises(ValueError, match="cutoff must be one of"):
         rasterize_projected(*first, colors, cutoff="tile3sigma", **size)
-    with pytest.raises(ValueError, match="width and height"):
-        rasterize_projected(*first, colors, width=0, height=4, cu_pairs=cu_pairs)
+    for width, height in ((0, 4), (4, 0), (2**16, 4), (4, 2**16)):
+        with pytest.raises(ValueError, match="width and height"):
+            rasterize_projected(*first, colors, width=width, height=height, cu_pairs=cu_pairs)
     with pytest.raises(ValueError, match="cu_pairs must ascend from 0 to 60"):
         rasterize_projected(*first, colors, width=4, height=4, cu_pairs=torch.tensor([0, 10]))
     with pytest.raises(NumericalError, match="means2d must be finite"):
