@@ -11,7 +11,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch._library.autograd import Info, make_autograd_impl
 from torch.autograd import forward_ad
 
 from gsim3d.errors import GradientError
@@ -64,13 +63,13 @@ def register_gradients(
             ``is_batched``; :func:`call` then has ``torch.func``.
     """
     backward = _without_autocast(backward)
-    _register(op, op, Info(backward, setup), without)
+    _register(op, op, backward, setup, without)
     if batched is not None:
         names = [argument.name for argument in getattr(torch.ops.gsim3d, op).default._schema.arguments]
         function = _function_of(op, backward, setup, jvp, batched)
         _functions[op] = function, {name: names.index(name) for name in without}
     for name in gradient_ops:
-        _register(name, op, Info(_second_derivative_of(op), None), ())
+        _register(name, op, _second_derivative_of(op), None, ())
 
 
 def call(op: str, *arguments: Any) -> Any:
@@ -188,27 +187,44 @@ def refuse(op: str, tensors: dict[str, Tensor], *, forward_only: bool = False) -
         raise GradientError(f"{op}: {name} {said}", op=op, argument=name, order=1)
 
 
-def _register(name: str, op: str, info: Info, without: Sequence[str]) -> None:
+def _register(name: str, op: str, backward: Callable, setup: Callable | None, without: Sequence[str]) -> None:
+    """As torch.library.register_autograd, which reads the schema in every call: a third of an op's time in Python."""
     overload = getattr(torch.ops.gsim3d, name).default
-    names, rule = [argument.name for argument in overload._schema.arguments], make_autograd_impl(overload, info)
+    arguments = overload._schema.arguments
+    names, defaults = [a.name for a in arguments], [a.default_value for a in arguments]
 
-    def kernel(keyset, *arguments):
-        refuse(op, dict(zip(names, arguments)), forward_only=True)
+    def compute(keyset, inputs):
+        with torch._C._AutoDispatchBelowAutograd():
+            return overload.redispatch(keyset & torch._C._after_autograd_keyset, *inputs)
+
+    class Function(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx, *inputs):
+            *inputs, keyset = inputs
+            output = compute(keyset, inputs)
+            if setup is not None:  # the dispatcher leaves out what equals its default
+                setup(ctx, (*inputs, *defaults[len(inputs) :]), output)
+            return output
+
+        @staticmethod
+        def backward(ctx, *grads):
+            found = backward(ctx, *grads)
+            return (*found, None) if isinstance(found, tuple) else (found, None)
+
+    def kernel(keyset, *inputs):
+        if forward_ad._current_level >= 0:
+            refuse(op, dict(zip(names, inputs)), forward_only=True)
+        if not torch.is_grad_enabled() or not torch._C._any_requires_grad(*inputs):
+            return compute(keyset, inputs)
         if without:
-            refuse(op, {name: value for name, value in zip(names, arguments) if name in without})
-        _refuse_transforms(op, arguments)
-        return rule(keyset, *arguments)
+            refuse(op, {name: value for name, value in zip(names, inputs) if name in without})
+        if torch._C._are_functorch_transforms_active() and not torch.compiler.is_compiling():  # those that an op has
+            said = "has no transforms of torch.func; use torch.autograd.grad"  # do not come here
+            raise GradientError(f"{op}: {said}", op=op, argument=None, order=1)
+        return Function.apply(*inputs, keyset)
 
+    Function.__name__ = Function.__qualname__ = f"{name}_backward"
     _library.impl(name, kernel, "Autograd", with_keyset=True)
-
-
-def _refuse_transforms(op: str, arguments: Sequence[Any]) -> None:
-    """Raises GradientError inside ``torch.func.grad`` and the like; those that an op has do not come here."""
-    if not torch._C._are_functorch_transforms_active() or torch.compiler.is_compiling() or not torch.is_grad_enabled():
-        return
-    if any(isinstance(x, Tensor) and x.requires_grad for x in arguments):
-        said = "has no transforms of torch.func; use torch.autograd.grad"
-        raise GradientError(f"{op}: {said}", op=op, argument=None, order=1)
 
 
 def _second_derivative_of(op: str) -> Callable:
