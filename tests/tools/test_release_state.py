@@ -401,9 +401,9 @@ def test_scores_against_windows_are_printed_with_paired_differences(first_run, t
         curve.main([str(tmp_path / "c.state.safetensors")])
 
 
-def test_committed_states_are_read_and_load(tmp_path, capsys):
+@pytest.mark.parametrize("file", sorted(STATES.glob("*.state.safetensors")), ids=lambda file: file.name.split(".")[0])
+def test_committed_states_are_read_and_load(file, tmp_path, capsys):
     """Also where the settings and the parameters of the model had other names when they were saved."""
-    (file,) = STATES.glob("*.state.safetensors")
     curve.main([str(file)])
     assert "| windows | minutes |" in capsys.readouterr().out
     name = file.name.split(".")[0]
@@ -411,7 +411,7 @@ def test_committed_states_are_read_and_load(tmp_path, capsys):
     trainer = RunTrainer(made.train, TrajectoryStore(made.stream(), 1, "cpu"), tmp_path, "cpu")
     before = {key: value.clone() for key, value in trainer.parameters.items()}
     progress = load_into(trainer, STATES, name)
-    assert trainer.step == progress.step > 0 and progress.windows > 10_000
+    assert trainer.step == progress.step > 0 and progress.windows > 1_000
     moments = [trainer.optimizer.state[parameter].get("exp_avg_sq") for parameter in trainer.parameters.values()]
     assert sum(value is not None and bool(value.any()) for value in moments) > 0.9 * len(moments)
     assert sum(not torch.equal(before[key], value) for key, value in trainer.parameters.items()) > 0.9 * len(before)
