@@ -32,12 +32,11 @@ class Format:
 
 
 _PACKED = "positions in 11, 10 and 11 bits of a chunk of 256, colours in 8"
-_FIXED = "positions to 0.13 mm, colours in 8 bits; version 3"
 FORMATS = {
     ".compressed.ply": Format(_PACKED, compressed_ply.write, compressed_ply.read, says_antialiased=True),
     ".ply": Format("3DGS layout, float32", None, None, says_antialiased=True),
     ".splat": Format("float32 positions and scales, colours in 8 bits", splat.write, splat.read, most_degree=0),
-    ".spz": Format(_FIXED, spz.write, spz.read, up="y", says_antialiased=True),
+    ".spz": Format("positions to 0.13 mm, 8-bit colours; version 3", spz.write, spz.read, "y", says_antialiased=True),
     ".glb": Format("glTF with KHR_gaussian_splatting, float32", gltf.write, gltf.read, up=None),
     ".usdc": Format("USD particle field, float32, with time", usd.write, usd.read, up=None, has_time=True),
     ".usda": Format("USD as text", usd.write, usd.read, up=None, has_time=True),

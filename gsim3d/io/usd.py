@@ -48,7 +48,10 @@ def write(path: Path, frames: Sequence[Splats], fps: float) -> None:
                 for name, chosen in _split(span):
                     prim = stage.DefinePrim(f"/Gaussians/{name}_{begin}", usd_child.TYPE)
                     _field(prim, begin, chosen, Sdf, Vt)
-                    _show(UsdGeom.Imageable(prim), begin, begin + len(span), len(frames))
+                    shown = {0: begin == 0, begin: True, begin + len(span): False} if len(span) < len(frames) else {}
+                    for time in shown.keys() & range(len(frames)):
+                        visibility = UsdGeom.Imageable(prim).CreateVisibilityAttr()
+                        visibility.Set("inherited" if shown[time] else "invisible", time)
             stage.GetRootLayer().Save()
         except RuntimeError as error:  # of pxr
             raise InputError(f"{path}: OpenUSD cannot write it: {usd_child.line(error)}") from None
@@ -90,15 +93,6 @@ def _spans(frames: Sequence[Splats]) -> Iterator[tuple[int, list[Splats]]]:
     for _, group in groupby(frames, lambda frame: frame.sh.shape):
         yield begin, (span := list(group))
         begin += len(span)
-
-
-def _show(field, begin: int, end: int, count: int) -> None:
-    """Makes a field of ``count`` frames visible from ``begin`` to before ``end``."""
-    shown = {0: begin == 0, begin: True, end: False}
-    if end - begin < count:
-        for time, is_shown in shown.items():
-            if time < count:
-                field.CreateVisibilityAttr().Set("inherited" if is_shown else "invisible", time)
 
 
 def _split(span: list[Splats]) -> Iterator[tuple[str, list[Splats]]]:

@@ -123,8 +123,7 @@ class SimulationPanel:
         self._place()
 
     def _place(self) -> None:
-        for handle in (self._middle, self._sides):
-            handle.visible = self._inside.value
+        self._middle.visible = self._sides.visible = self._inside.value
         box = self._box
         box.position, box.dimensions, box.visible = self._middle.value, self._sides.value, self._inside.value
 

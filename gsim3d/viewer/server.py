@@ -96,8 +96,10 @@ class Viewer:
         self.close()
 
     def close(self) -> None:
-        """Stops the server; its port is free again. What is being simulated is waited for, and shown no more."""
+        """Stops what is being simulated, and the server; its port is free again."""
         self._closed.set()
+        if self._simulation is not None:
+            self._simulation.is_closed = True
         self._work.put((None, None))
         for thread in self._threads:
             thread.join()

@@ -4,6 +4,8 @@ import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -76,6 +78,7 @@ class Simulation:
         parts: what was predicted up to now.
         effects: what the next predicted part computes.
         seconds_a_step: that the last prediction took.
+        is_closed: whether a prediction in another thread stops after its step.
     """
 
     def __init__(self, restored: Restored, source: Scene | Particles, n_steps: int | None = None, start: int = 0):
@@ -87,7 +90,7 @@ class Simulation:
         Raises:
             InputError: the scene has too few steps or cameras.
         """
-        self._simulator, self.seconds_a_step = restored.simulator, 0.0
+        self._simulator, self.seconds_a_step, self.is_closed = restored.simulator, 0.0, False
         self.parts: list[Part] = []
         self._frames: Frames | None = None
         self._spreads: dict[Part, Tensor] = {}
@@ -98,9 +101,7 @@ class Simulation:
         self.effects = EffectsSpec(dynamics, appearance, spec.structure, OutputEffects())
         about = {"name": "state", "fps": restored.fps or 24.0}
         if isinstance(source, Scene):
-            inputs = restored.simulator.inputs
-            assert inputs is not None  # of what was trained
-            self._frames = source.input_frames(inputs, start=start)
+            self._frames = source.input_frames(restored.simulator.inputs, start=start)
             with torch.no_grad():
                 state = encode(restored.simulator, self._frames, (str(source.path),))
             about = {"name": source.name, "fps": source.fps, "scene": source, "first": start}
@@ -164,11 +165,16 @@ class Simulation:
     def _timed(self, history: Particles, n_steps: int, plan: Plan) -> tuple[list[Particles], Plan, float]:
         """Predicted steps, their plan, and the seconds that one and its Gaussians took."""
         began = time.perf_counter()
-        steps = self._simulator.rollout(history, n_steps, plan)
+        steps = self._simulator.rollout(history, n_steps, plan, wrap=lambda predict: partial(self._called, predict))
         for particles in steps:
             drawn = self._simulator.renderer(particles, sh_degree=plan.sh_degree)
         drawn.means.sum().item()  # waits for the device
         return steps, plan, (time.perf_counter() - began) / n_steps
+
+    def _called(self, predict: Callable, *given: Any, **options: Any) -> Particles:
+        if self.is_closed:
+            raise InputError("simulate on: the viewer was closed")
+        return predict(*given, **options)
 
     def simulate_on(self, frame: int, n_steps: int, operations: Sequence[Operation] = ()) -> None:
         """Predicts the frames after ``frame`` anew, with the effects that are on; earlier edits stay, later ones go.

@@ -319,6 +319,17 @@ def test_clicks_during_a_simulation_are_done_in_order_as_they_were_meant(viser, 
         assert viewer.timeline.n_frames == 7 and not click.said
 
 
+def test_closing_ends_a_long_simulation_after_its_step(viser, simulation):
+    with server.Viewer(simulation.target, simulation) as viewer:
+        click = Clicks()
+        viewer._panel._steps.value = 1_000_000
+        viewer.on(click, viewer._panel._simulate, "on_click")
+        click()
+        until(lambda: "at work" in viewer._status.content)
+        began = time.monotonic()
+    assert time.monotonic() - began < 20 and "closed" in click.said[0][1] and simulation.target.n_frames == 5
+
+
 def test_what_fails_in_the_clock_is_shown_and_stops_time(viser, tmp_path, capsys):
     for step, frame in enumerate(falling()):
         write_splats(tmp_path / f"step_{step}.ply", frame)
