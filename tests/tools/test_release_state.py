@@ -404,9 +404,10 @@ def test_scores_against_windows_are_printed_with_paired_differences(first_run, t
 @pytest.mark.parametrize("file", sorted(STATES.glob("*.state.safetensors")), ids=lambda file: file.name.split(".")[0])
 def test_committed_states_are_read_and_load(file, tmp_path, capsys):
     """Also where the settings and the parameters of the model had other names when they were saved."""
-    curve.main([str(file)])
-    assert "| windows | minutes |" in capsys.readouterr().out
     name = file.name.split(".")[0]
+    if load_progress(STATES, name).scores:
+        curve.main([str(file)])
+        assert "| windows | minutes |" in capsys.readouterr().out
     made = recipe(*name.split("-"))
     trainer = RunTrainer(made.train, TrajectoryStore(made.stream(), 1, "cpu"), tmp_path, "cpu")
     before = {key: value.clone() for key, value in trainer.parameters.items()}
