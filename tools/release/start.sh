@@ -3,8 +3,9 @@
 #
 #   setsid bash DIR/start.sh DIR WORK [options of tools/release/train.py] >WORK.log 2>&1 &
 #
-# WORK/out holds the state and its video at any time. --state, --out, --device and --commit are set here. A build that
-# another run left in DIR/build (made by this script in WORK/build) is used if it is of the same sources.
+# WORK/out holds the state and its video at any time. --state, --out, --device and --commit are set here. Several runs
+# share a host with CUDA_VISIBLE_DEVICES, taskset and a WORK each. A build that another run left in DIR/build (made by
+# this script in WORK/build) is used if it is of the same sources; torch 2.11 runs what a later one has built.
 set -euo pipefail
 [ $# -ge 3 ] || { echo "usage: bash start.sh DIR WORK WORLD --minutes M [options]" >&2; exit 2; }
 packed="$(realpath "$1")" && mkdir -p "$2" && work="$(realpath "$2")" && shift 2
@@ -26,8 +27,8 @@ else
   for file in gsim3d/*.so; do xz -T0 -c "$file" >"$work/build/$(basename "$file").xz"; done
   echo "$sources" >"$work/build/sources"
 fi
-gpus="$(nvidia-smi -L | wc -l)"
+gpus="$(python3 -c 'import torch; print(torch.cuda.device_count())')"
 command=(python3 -u)
-[ "$gpus" -le 1 ] || command=(torchrun --nproc-per-node "$gpus")
+[ "$gpus" -le 1 ] || command=(torchrun --standalone --nproc-per-node "$gpus")
 exec "${command[@]}" tools/release/train.py "$@" \
   --state "$work/out" --out "$work/out" --device cuda --commit "$(cat "$packed/commit")"
