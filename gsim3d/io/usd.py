@@ -48,10 +48,9 @@ def write(path: Path, frames: Sequence[Splats], fps: float) -> None:
                 for name, chosen in _split(span):
                     prim = stage.DefinePrim(f"/Gaussians/{name}_{begin}", usd_child.TYPE)
                     _field(prim, begin, chosen, Sdf, Vt)
-                    shown = {0: begin == 0, begin: True, begin + len(span): False} if len(span) < len(frames) else {}
-                    for time in shown.keys() & range(len(frames)):
-                        visibility = UsdGeom.Imageable(prim).CreateVisibilityAttr()
-                        visibility.Set("inherited" if shown[time] else "invisible", time)
+                    field, shown = UsdGeom.Imageable(prim), {0: begin == 0, begin: True, begin + len(span): False}
+                    for at in shown.keys() & range(len(frames)) if len(span) < len(frames) else ():
+                        field.CreateVisibilityAttr().Set("inherited" if shown[at] else "invisible", at)
             stage.GetRootLayer().Save()
         except RuntimeError as error:  # of pxr
             raise InputError(f"{path}: OpenUSD cannot write it: {usd_child.line(error)}") from None
@@ -67,9 +66,7 @@ def read(path: Path) -> Splats:
     _pxr(path)  # is installed
     with TemporaryDirectory() as place:
         out = Path(place) / "arrays.npz"
-        few = dict.fromkeys(("PXR_WORK_THREAD_LIMIT", "OPENBLAS_NUM_THREADS", "MALLOC_ARENA_MAX"), "1")  # address space
-        command = [sys.executable, "-P", usd_child.__file__, str(path), str(out)]
-        if status := subprocess.run(command, env={**os.environ, **few}, capture_output=True).returncode:
+        if status := _child(str(path), str(out)):
             ended = signal.Signals(-status).name if status < 0 else f"code {status}"
             raise InputError(f"{path}: damaged, or too large: OpenUSD was ended by {ended} while reading it")
         with np.load(out) as file:
@@ -85,6 +82,13 @@ def read(path: Path) -> Splats:
     parts = [placed(Splats(*part), place, path) for *part, place in zip(*columns, found["places"])]
     whole = placed(joined(parts, path), np.diag([unit, unit, unit, 1.0]), path)
     return turned(whole, Y_TO_Z_UP) if found["is_y_up"] else whole
+
+
+def _child(file: str, out: str) -> int:
+    """Runs ``usd_child``; its exit status."""
+    few = dict.fromkeys(("PXR_WORK_THREAD_LIMIT", "OPENBLAS_NUM_THREADS", "MALLOC_ARENA_MAX"), "1")  # address space
+    command = [sys.executable, "-P", usd_child.__file__, file, out]
+    return subprocess.run(command, env={**os.environ, **few}, capture_output=True).returncode
 
 
 def _spans(frames: Sequence[Splats]) -> Iterator[tuple[int, list[Splats]]]:
