@@ -113,7 +113,7 @@ def _gaussians(path: Path, table: dict[str, np.ndarray]) -> Gaussians:
         own, scales = scales, torch.hypot(scales, stack(["filter_3D"]))
         opacities = opacities * (own / scales.clamp_min(SMALLEST_SCALE)).prod(1)
     quats, sh = unit_quats(stack(["rot_0", "rot_1", "rot_2", "rot_3"])), _colors(path, stack, table).contiguous()
-    gaussians = Gaussians(means, quats, scales, opacities, sh, torch.tensor([0, len(means)]), offset)
+    gaussians = Gaussians(means, quats, scales, opacities, sh, torch.tensor([0, len(means)]), world_offset=offset)
     for name in FIELDS:
         if not torch.isfinite(getattr(gaussians, name)).all():
             raise InputError(f"{path}: {name} holds values that are not finite")
