@@ -8,7 +8,7 @@ import torch
 from gsim3d.priors import SubcellMotionConfig
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import TINY, make_dynamics, make_history
-from tests.priors.scenes import build, context, with_priors
+from tests.priors.scenes import context, with_priors
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 PLAIN = dataclasses.replace(TINY, position_features=False)
@@ -49,7 +49,8 @@ def test_network_reads_both(change):
 def test_features():
     history = centered(make_history())
     velocity = torch.rand(history.means.shape, generator=torch.Generator().manual_seed(0)) - 0.5
-    ctx = context(dataclasses.replace(nudged(history), velocity=velocity), SubcellMotionConfig(), grid_size=TINY.grid_size)
+    moved = dataclasses.replace(nudged(history), velocity=velocity)
+    ctx = context(moved, SubcellMotionConfig(), grid_size=TINY.grid_size)
     inside, last = ctx.priors.get("subcell_motion").features(ctx).split(3, 1)
     assert_close_relative_to_max(inside, torch.full_like(inside, 0.6), 1e-3)
     assert_close_relative_to_max(last, velocity / TINY.grid_size, 1e-6)
