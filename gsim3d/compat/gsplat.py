@@ -145,39 +145,41 @@ def rasterization(
     antialiased = rasterize_mode == "antialiased"
 
     lens, distortion = _lens(LENSES[camera_model], radial_coeffs, tangential_coeffs, n_images)
-    image_cloud = torch.arange(n_batches, device=means.device).repeat_interleave(n_cameras, output_size=n_images)
-    no_plane = means.new_zeros(n_images)
-    cameras = Cameras(viewmats.reshape(-1, 4, 4), Ks.reshape(-1, 3, 3), no_plane, no_plane, image_cloud, width, height)
-    shapes = (None, None) if covars is not None else (quats.reshape(-1, 4), scales.reshape(-1, 3))
+    no_plane, owners = means.new_empty(n_images), torch.empty(n_images, dtype=torch.int64, device=means.device)
+    cameras = Cameras(viewmats.flatten(0, -3), Ks.flatten(0, -3), no_plane, no_plane, owners, width, height)
+    shapes = (None, None) if covars is not None else (quats.flatten(0, -2), scales.flatten(0, -2))
     limits = {"near_plane": near_plane, "far_plane": far_plane, "radius_clip": radius_clip, "dilation": eps2d}
     options = {"lens": lens, "distortion": distortion, "jacobian": "clamped", "antialiased": antialiased, **limits}
-    options["cu_rows"] = torch.arange(n_batches + 1, device=means.device) * n
-    options["covars"] = None if covars is None else covars.reshape(-1, 3, 3)
+    options["covars"] = None if covars is None else covars.flatten(0, -3)
+    flat_opacities = opacities.flatten()
     projection = project_gaussians(
-        means.reshape(-1, 3), *shapes, cameras, opacities=opacities.reshape(-1), n_pairs=n_images * n, **options
+        means.flatten(0, -2), *shapes, cameras, opacities=flat_opacities, n_clouds=n_batches, **options
     )
     values = _colors(colors, sh_degree, means, viewmats) if with_color else means.new_zeros(n_images * n, 0)
-    of_images = opacities[..., None, :].expand(*batch, n_cameras, n).reshape(-1)
-    alphas = of_images * projection.compensations if antialiased else of_images
-    rows = (*projection[:4], alphas, values.flatten(0, -2))
-    meta, cu_pairs = Meta(batch_ids=None, camera_ids=None, gaussian_ids=None), projection.cu_pairs
+    alphas = flat_opacities
+    if n_cameras != 1:
+        alphas = opacities[..., None, :].expand(*batch, n_cameras, n).reshape(-1)
+    alphas = alphas * projection.compensations if antialiased else alphas
+    rows, cu_pairs = (*projection[:4], alphas, values), projection.cu_pairs
+    meta = Meta(batch_ids=None, camera_ids=None, gaussian_ids=None)
     sizes = (*batch, n_cameras, n)
     if packed:
         rows, cu_pairs, ids = _seen(rows, projection, n, n_cameras)
         meta |= ids
         sizes = (rows[0].shape[0],)
-    # The 2D means as they are in meta are what is blended, so that they get a gradient.
-    rows = tuple(row.reshape(*sizes, *row.shape[1:]) for row in rows)
     means2d, conics, depths, radii, alphas, values = rows
-    meta |= {"radii": radii, "means2d": means2d, "depths": depths, "conics": conics, "opacities": alphas}
+    known = {"radii": radii, "means2d": means2d, "depths": depths, "conics": conics, "opacities": alphas}
+    meta |= {name: row.reshape(*sizes, *row.shape[1:]) for name, row in known.items()}
     meta |= {"width": width, "height": height, "tile_size": 16 if tile_size is None else tile_size}
     meta |= {"n_batches": n_batches, "n_cameras": n_cameras}
-    flat = [row.flatten(0, len(sizes) - 1) for row in (means2d, conics, depths, alphas, values)]
+    # The 2D means as they are in meta are what is blended, so that they get a gradient.
+    means2d = meta["means2d"]
     backgrounds = backgrounds.flatten(0, -2) if with_color and backgrounds is not None else None
     absolute = _absolute(means2d) if absgrad and means2d.requires_grad else None
     image = rasterize_projected(
-        *flat, width=width, height=height, cu_pairs=cu_pairs, background=backgrounds, absolute=absolute
-    )
+        *(means2d.flatten(0, -2), conics, depths, alphas, values),
+        width=width, height=height, cu_pairs=cu_pairs, background=backgrounds, absolute=absolute,
+    )  # fmt: skip
     color, alpha = _images(image, render_mode if with_depth else "RGB", (*batch, n_cameras))
     return color, alpha, meta
 
@@ -226,17 +228,18 @@ def _lens(lens: str, radial: Tensor | None, tangential: Tensor | None, n_images:
 
 
 def _colors(colors: Tensor | None, sh_degree: int | None, means: Tensor, viewmats: Tensor) -> Tensor:
-    """[..., C, N, D]."""
+    """Colours of pairs, [I N, D]."""
     batch, n, n_cameras = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
     if colors is None:
         raise ValueError("rasterization: colors are needed, unless render_mode is D or ED")
     if sh_degree is None:
-        if colors.shape[:-1] == (*batch, n):
-            colors = colors[..., None, :, :].expand(*batch, n_cameras, n, colors.shape[-1])
-        if colors.shape[:-1] != (*batch, n_cameras, n):
+        of_images = colors.shape[:-1] == (*batch, n_cameras, n)
+        if not of_images and colors.shape[:-1] != (*batch, n):
             wanted = f"{[*batch, n, 'D']} or {[*batch, n_cameras, n, 'D']}"
             raise ValueError(f"rasterization: colors must be {wanted}; got {list(colors.shape)}")
-        return colors
+        if not of_images and n_cameras != 1:
+            colors = colors[..., None, :, :].expand(*batch, n_cameras, n, colors.shape[-1])
+        return colors.flatten(0, -2)
     check_whole("rasterization", sh_degree=sh_degree)
     shared, n_terms = colors.dim() == 3, (sh_degree + 1) ** 2
     if colors.shape[:-2] not in ((n,), (*batch, n)) or not 0 <= sh_degree <= 4 or colors.shape[-2] < n_terms:
@@ -247,7 +250,7 @@ def _colors(colors: Tensor | None, sh_degree: int | None, means: Tensor, viewmat
     centre = -(turned.mT @ moved[..., None])[..., 0]
     directions = means[..., None, :, :] - centre[..., None, :]
     rows = (directions.flatten(0, -3), sh) if shared else (directions.flatten(0, -4), sh.flatten(0, -4))
-    return sh_to_color(*rows).reshape(*directions.shape[:-1], sh.shape[-1])
+    return sh_to_color(*rows).flatten(0, -2)
 
 
 def _seen(rows: tuple[Tensor, ...], projection: Projection, n: int, n_cameras: int) -> tuple:
@@ -281,4 +284,6 @@ def _images(image: Rendering, render_mode: str, sizes: tuple[int, ...]) -> tuple
         depth = depth / alpha.clamp_min(1e-10)
     parts = {"RGB": [image.color], "D": [depth], "ED": [depth]}.get(render_mode, [image.color, depth])
     color = torch.cat(parts, -1) if len(parts) > 1 else parts[0]
-    return color.reshape(*sizes, *color.shape[1:]), alpha.reshape(*sizes, *alpha.shape[1:])
+    if len(sizes) == 1:
+        return color, alpha
+    return color.unflatten(0, sizes), alpha.unflatten(0, sizes)

@@ -4,7 +4,9 @@ The kernels check shapes, dtypes and index lists. Here it is made sure that tens
 the CPU that features and weights are numbers that an op can use; looking for those on a GPU would wait for it.
 """
 
+import functools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -74,6 +76,26 @@ def check_numbers(op: str, *, largest_of: float = math.inf, negative: bool = Tru
         low, high = torch.aminmax(value.detach())
         if not (low >= least and high <= largest):  # NaN is in neither range
             _refuse(op, name, value.detach(), largest, least)
+
+
+def index_list(make: Callable[..., Tensor], *sizes: int, device: torch.device) -> Tensor:
+    """``make(*sizes, device=device)``, an index list that must not be modified; kept for later calls, unless they are
+    traced or captured in a graph, whose memory ends with it."""
+    traced = torch.compiler.is_compiling() or torch._C._len_torch_dispatch_stack() > 0
+    if traced or (device.type == "cuda" and torch.cuda.is_current_stream_capturing()):
+        return make(*sizes, device=device)
+    return _recent(make, sizes, device, torch.cuda.current_stream(device) if device.type == "cuda" else None)
+
+
+@functools.lru_cache(maxsize=256)
+def _recent(make: Callable[..., Tensor], sizes: tuple[int, ...], device: torch.device, stream: Any) -> Tensor:
+    with torch.inference_mode(False):
+        return make(*sizes, device=device)
+
+
+def offsets(count: int, n: int, *, device: torch.device) -> Tensor:
+    """int64 [count + 1], offsets of ``count`` lists of ``n``."""
+    return torch.arange(count + 1, device=device) * n
 
 
 def widened(x: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ from gsim3d.ops import _load  # noqa: F401
 
 _library = torch.library.Library("gsim3d", "FRAGMENT")
 _functions: dict[str, tuple[type[torch.autograd.Function], dict[str, int]]] = {}  # and places without a gradient
+_kernels: dict[str, Callable] = {}  # what the key Autograd runs
 _casts: dict[str, Callable[[str, Sequence[Any]], Sequence[Any]]] = {}  # rules of autocast
 _no_autocast = torch._C.DispatchKeySet(torch._C.DispatchKey.AutocastCPU)
 _no_autocast = _no_autocast | torch._C.DispatchKeySet(torch._C.DispatchKey.AutocastCUDA)
@@ -74,14 +75,24 @@ def register_gradients(
 
 def call(op: str, *arguments: Any) -> Any:
     """What gsim3d::``op`` returns, also under the transforms of ``torch.func`` and in forward mode."""
+    overload = getattr(torch.ops.gsim3d, op).default
+    if torch.compiler.is_compiling():
+        return overload(*arguments)
     transformed = torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0
-    if transformed and op in _functions and not torch.compiler.is_compiling():
+    if not transformed and op in _kernels and not torch._C._len_torch_dispatch_stack() and not _casting(arguments):
+        return _kernels[op](None, *arguments)  # as the dispatcher does, which converts all arguments there and back
+    if transformed and op in _functions:
         function, without = _functions[op]
         refuse(op, {name: arguments[k] for name, k in without.items()})
         if op in _casts and (device := arguments[0].device.type) != "meta" and torch.is_autocast_enabled(device):
             arguments = tuple(_casts[op](device, arguments))  # rules of gradients see what is computed with
         return _without_autocast(function.apply)(*arguments)
-    return getattr(torch.ops.gsim3d, op)(*arguments)
+    return overload(*arguments)
+
+
+def _casting(arguments: Sequence[Any]) -> bool:
+    device = next(x for x in arguments if isinstance(x, Tensor)).device.type
+    return device == "meta" or torch.is_autocast_enabled(device)
 
 
 def _function_of(op: str, backward: Callable, setup: Callable, jvp: Callable | None, batched: Callable) -> type:
@@ -195,6 +206,8 @@ def _register(name: str, op: str, backward: Callable, setup: Callable | None, wi
 
     def compute(keyset, inputs):
         with torch._C._AutoDispatchBelowAutograd():
+            if keyset is None:
+                return overload(*inputs)
             return overload.redispatch(keyset & torch._C._after_autograd_keyset, *inputs)
 
     class Function(torch.autograd.Function):
@@ -208,7 +221,11 @@ def _register(name: str, op: str, backward: Callable, setup: Callable | None, wi
 
         @staticmethod
         def backward(ctx, *grads):
-            found = backward(ctx, *grads)
+            if torch.is_grad_enabled():
+                found = backward(ctx, *grads)
+            else:
+                with torch._C._AutoDispatchBelowAutograd():
+                    found = backward(ctx, *grads)
             return (*found, None) if isinstance(found, tuple) else (found, None)
 
     def kernel(keyset, *inputs):
@@ -224,6 +241,7 @@ def _register(name: str, op: str, backward: Callable, setup: Callable | None, wi
         return Function.apply(*inputs, keyset)
 
     Function.__name__ = Function.__qualname__ = f"{name}_backward"
+    _kernels[name] = kernel
     _library.impl(name, kernel, "Autograd", with_keyset=True)
 
 

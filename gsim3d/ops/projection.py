@@ -9,8 +9,17 @@ from torch import Tensor
 
 from gsim3d.cameras import Cameras
 from gsim3d.errors import check_one_of
-from gsim3d.ops._arguments import check_floating, check_numbers, check_real, check_splits, check_tensors, within_memory
-from gsim3d.ops._register import fakes, register_autocast, register_gradients, save_inputs
+from gsim3d.ops._arguments import (
+    check_floating,
+    check_numbers,
+    check_real,
+    check_splits,
+    check_tensors,
+    index_list,
+    offsets,
+    within_memory,
+)
+from gsim3d.ops._register import call, fakes, register_autocast, register_gradients, save_inputs
 from gsim3d.ops.raster import LARGEST, check_scene
 
 OP = "project_gaussians"
@@ -52,6 +61,7 @@ def project_gaussians(
     lens: str = "pinhole",
     distortion: Tensor | None = None,
     cu_rows: Tensor | None = None,
+    n_clouds: int | None = None,
     n_pairs: int | None = None,
     near_plane: float = 0.01,
     far_plane: float = 1e10,
@@ -78,6 +88,8 @@ def project_gaussians(
             "fisheye": OpenCV's equidistant one.
         distortion: [I, 4, 5 or 8] k1, k2, p1, p2, k3, k4, k5, k6 of "opencv", [I, 4] k1 to k4 of "fisheye"; None: 0.
         cu_rows: int64 [Q + 1], rows of cloud q are cu_rows[q] .. cu_rows[q + 1]; default one cloud.
+        n_clouds: rows, and images, are those of so many clouds of one size, in order, in place of ``cu_rows`` and
+            ``cameras.image_cloud``.
         n_pairs: P; counted where it is not given, so on a GPU it is needed beside ``cu_rows``.
         near_plane, far_plane: metres of camera z.
         radius_clip: pixels.
@@ -111,16 +123,23 @@ def project_gaussians(
     """
     given = {"quats": quats, "scales": scales, "covars": covars, "opacities": opacities, "distortion": distortion}
     tensors = {"means": means} | {name: value for name, value in given.items() if value is not None}
-    _check(tensors, cameras, cu_rows, {} if n_pairs is None else {"n_pairs": n_pairs}, lens, jacobian)
+    sizes = {name: size for name, size in (("n_clouds", n_clouds), ("n_pairs", n_pairs)) if size is not None}
+    _check(tensors, cameras, cu_rows, sizes, lens, jacobian)
     check_real(OP, near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, dilation=dilation)
-    n, n_images = means.shape[0], cameras.viewmats.shape[0]
-    if cu_rows is None:
-        cu_rows = torch.tensor([0, n], device=means.device)
-        n_pairs = n * n_images if n_pairs is None else n_pairs
-    counts = F.pad(cu_rows[1:] - cu_rows[:-1], (0, 1))  # a cloud that is none has no rows
-    cu_pairs = F.pad(counts[cameras.image_cloud.clamp(0, len(counts) - 1)].cumsum(0), (1, 0))
+    n, n_images, device, image_cloud = means.shape[0], len(cameras), means.device, cameras.image_cloud
+    if n_clouds is not None:
+        each = n // max(1, n_clouds)
+        image_cloud = index_list(_owners, n_clouds, n_images // max(1, n_clouds), device=device)
+        cu_rows = index_list(offsets, n_clouds, each, device=device)
+        cu_pairs, n_pairs = index_list(offsets, n_images, each, device=device), n_images * each
+    else:
+        if cu_rows is None:
+            cu_rows = index_list(offsets, 1, n, device=device)
+            n_pairs = n * n_images if n_pairs is None else n_pairs
+        counts = F.pad(cu_rows[1:] - cu_rows[:-1], (0, 1))  # a cloud that is none has no rows
+        cu_pairs = F.pad(counts[image_cloud.clamp(0, len(counts) - 1)].cumsum(0), (1, 0))
     if n_pairs is None:
-        if means.device.type != "cpu":
+        if device.type != "cpu":
             raise ValueError(f"{OP}: n_pairs is needed beside cu_rows on a GPU, where counting would wait for it")
         n_pairs = int(cu_pairs[-1])
     limits = None
@@ -130,12 +149,17 @@ def project_gaussians(
     args = (
         *(means, quats, scales, covars, None if opacities is None else opacities.detach()),
         *(cameras.viewmats.to(means.dtype), cameras.Ks.to(means.dtype), distortion, limits),
-        *(cameras.image_cloud, cu_rows, cu_pairs, n_pairs, cameras.width, cameras.height),
+        *(image_cloud, cu_rows, cu_pairs, n_pairs, cameras.width, cameras.height),
         *(near_plane, far_plane, radius_clip, dilation, LENSES[lens], jacobian == "clamped", antialiased),
     )
-    made = within_memory(OP, f"n_pairs={n_pairs}", torch.ops.gsim3d.project_gaussians, *args)
+    made = within_memory(OP, f"n_pairs={n_pairs}", call, OP, *args)
     means2d, conics, depths, radii, compensations = made
     return Projection(means2d, conics, depths, radii, compensations, cu_pairs)
+
+
+def _owners(n_clouds: int, n_images: int, *, device: torch.device) -> Tensor:
+    """int64 [n_clouds * n_images], which cloud each image shows."""
+    return torch.arange(n_clouds, device=device).repeat_interleave(n_images, output_size=n_clouds * n_images)
 
 
 def lens_limits(lens: str, distortion: Tensor) -> Tensor:
@@ -201,7 +225,7 @@ def sh_to_color(directions: Tensor, sh: Tensor) -> Tensor:
     check_numbers("sh_to_color", largest_of=LARGEST, directions=directions, sh=sh)
     seen = directions[(None,) * (4 - directions.dim())]
     of_rows = sh[(None,) * (4 - sh.dim())].to(directions.dtype)
-    return torch.ops.gsim3d.sh_to_color(seen, of_rows).reshape(*directions.shape[:-1], sh.shape[-1])
+    return call("sh_to_color", seen, of_rows).reshape(*directions.shape[:-1], sh.shape[-1])
 
 
 def _check(tensors: dict, cameras: Cameras, cu_rows: Tensor | None, sizes: dict, lens: str, jacobian: str) -> None:
@@ -210,6 +234,11 @@ def _check(tensors: dict, cameras: Cameras, cu_rows: Tensor | None, sizes: dict,
         raise ValueError(f"{OP}: give quats and scales, or covars")
     check_one_of(f"{OP}: lens", lens, LENSES)
     check_one_of(f"{OP}: jacobian", jacobian, JACOBIANS)
+    n, n_clouds = len(tensors["means"]), sizes.get("n_clouds", 1)
+    split = all(size == (0 if n_clouds == 0 else size // n_clouds * n_clouds) for size in (n, len(cameras)))
+    if n_clouds < 0 or not split or (cu_rows is not None and "n_clouds" in sizes):
+        wanted = f"divide N={n} rows and I={len(cameras)} images, and stand in place of cu_rows"
+        raise ValueError(f"{OP}: n_clouds must {wanted}; got {n_clouds}")
     clouds = cameras.image_cloud
     if clouds.dtype != torch.int64 or clouds.dim() != 1:
         raise ValueError(f"{OP}: cameras.image_cloud must be int64 [I]; got {clouds.dtype} {list(clouds.shape)}")

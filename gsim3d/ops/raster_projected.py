@@ -5,8 +5,17 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsim3d.errors import check_one_of
-from gsim3d.ops._arguments import check_floating, check_numbers, check_splits, check_tensors, check_whole, within_memory
-from gsim3d.ops._register import fakes, register_autocast, register_gradients
+from gsim3d.ops._arguments import (
+    check_floating,
+    check_numbers,
+    check_splits,
+    check_tensors,
+    check_whole,
+    index_list,
+    offsets,
+    within_memory,
+)
+from gsim3d.ops._register import call, fakes, register_autocast, register_gradients
 from gsim3d.ops.raster import CUTOFFS, LARGEST, Rendering, empty_images, grads_of_images, sizes_of_state, state_bytes
 
 OP = "rasterize_projected"
@@ -63,25 +72,33 @@ def rasterize_projected(
     rows = {"means2d": means2d, "conics": conics, "depths": depths, "opacities": opacities, "colors": colors}
     optional = {"cu_pairs": cu_pairs, "background": background, "absolute": absolute}
     _check(rows, {name: value for name, value in optional.items() if value is not None}, width, height, cutoff)
+    device = means2d.device
     if cu_pairs is None:
-        cu_pairs = torch.tensor([0, means2d.shape[0]], device=means2d.device)
+        cu_pairs = index_list(offsets, 1, means2d.shape[0], device=device)
     n_images, n_channels = cu_pairs.shape[0] - 1, colors.shape[1]
     if background is None:
         background = means2d.new_zeros(n_images, n_channels)
     background = background.expand(n_images, n_channels).to(means2d.dtype)
-    colors = colors.to(means2d.dtype)
-    missing = max(0, 3 - n_channels)
+    color, features = _three_and_more(colors.to(means2d.dtype))
     args = (
-        *(means2d, conics, depths, opacities, F.pad(colors[:, :3], (0, missing)), colors[:, 3:]),
-        *(F.pad(background[:, :3], (0, missing)), absolute, torch.arange(n_images, device=means2d.device), cu_pairs),
-        *(width, height, CUTOFFS[cutoff], *sizes_of_state(means2d, n_images, n_images, width, height)),
+        *(means2d, conics, depths, opacities, color, features, _three_and_more(background)[0], absolute),
+        *(index_list(torch.arange, n_images, device=device), cu_pairs, width, height, CUTOFFS[cutoff]),
+        *sizes_of_state(means2d, n_images, n_images, width, height),
     )
-    out = within_memory(OP, f"width={width}, height={height}", torch.ops.gsim3d.rasterize_projected, *args)
+    out = within_memory(OP, f"width={width}, height={height}", call, OP, *args)
     color, alpha, depth, features = out[:4]
     if n_channels > 3:
         behind = (1 - alpha)[..., None] * background[:, None, None, 3:]
         color = torch.cat([color, features + behind], -1)
-    return Rendering(color[..., :n_channels], alpha, depth, None)
+    return Rendering(color[..., :n_channels] if n_channels < 3 else color, alpha, depth, None)
+
+
+def _three_and_more(channels: Tensor) -> tuple[Tensor, Tensor]:
+    """The first three of [N, D] channels, zeros where there are fewer, and the others; copies nothing of three."""
+    n, d = channels.shape
+    if d <= 3:
+        return channels if d == 3 else F.pad(channels, (0, 3 - d)), channels.new_empty(n, 0)
+    return channels[:, :3], channels[:, 3:]
 
 
 def _check(rows: dict[str, Tensor], optional: dict[str, Tensor], width: int, height: int, cutoff: str) -> None:
