@@ -12,7 +12,6 @@ from gsim3d.priors.position_waves import PositionWaves, PositionWavesConfig
 from gsim3d.priors.proximity import Proximity, ProximityConfig
 from gsim3d.priors.segmentation import Segmentation, SegmentationConfig
 from gsim3d.priors.shape_matching import ShapeMatching, ShapeMatchingConfig
-from gsim3d.priors.subcell_motion import SubcellMotion, SubcellMotionConfig
 from gsim3d.priors.velocity_from_images import VelocityFromImages, VelocityFromImagesConfig
 
 __all__ = [
@@ -38,8 +37,6 @@ __all__ = [
     "ShapeMatching",
     "ShapeMatchingConfig",
     "StepContext",
-    "SubcellMotion",
-    "SubcellMotionConfig",
     "VelocityFromImages",
     "VelocityFromImagesConfig",
 ]
