@@ -78,16 +78,18 @@ def call(op: str, *arguments: Any) -> Any:
     overload = getattr(torch.ops.gsim3d, op).default
     if torch.compiler.is_compiling():
         return overload(*arguments)
-    transformed = torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0
-    if not transformed and op in _kernels and not torch._C._len_torch_dispatch_stack() and not _casting(arguments):
-        return _kernels[op](None, *arguments)  # as the dispatcher does, which converts all arguments there and back
-    if transformed and op in _functions:
+    if torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0:
+        if op not in _functions:
+            return overload(*arguments)
         function, without = _functions[op]
         refuse(op, {name: arguments[k] for name, k in without.items()})
         if op in _casts and (device := arguments[0].device.type) != "meta" and torch.is_autocast_enabled(device):
             arguments = tuple(_casts[op](device, arguments))  # rules of gradients see what is computed with
         return _without_autocast(function.apply)(*arguments)
-    return overload(*arguments)
+    watched = torch._C._len_torch_dispatch_stack() > 0 or not isinstance(overload, torch._ops.OpOverload)
+    if watched or op not in _kernels or _casting(arguments):
+        return overload(*arguments)
+    return _kernels[op](None, *arguments)  # the dispatcher would convert all arguments there and back
 
 
 def _casting(arguments: Sequence[Any]) -> bool:

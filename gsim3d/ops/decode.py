@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.ops._arguments import check_numbers, check_real, check_tensors, check_whole
-from gsim3d.ops._register import fakes, is_narrow, register_autocast, register_gradients, save_inputs
+from gsim3d.ops._register import call, fakes, is_narrow, register_autocast, register_gradients, save_inputs
 
 LARGEST_READING = 1e3  # cubes of readings times the largest ``raw`` stay finite; those of the table are below 2
 
@@ -44,7 +44,7 @@ def decode_gaussians(
         check_real("decode_gaussians", scale_min=scale_min, scale_max=scale_max)
         check_numbers("decode_gaussians", raw=raw)
         check_numbers("decode_gaussians", readings=readings, largest_of=LARGEST_READING)
-    return torch.ops.gsim3d.decode_gaussians(raw, readings, degree, scale_min, scale_max)
+    return call("decode_gaussians", raw, readings, degree, scale_min, scale_max)
 
 
 def _decoded(raw, readings, degree, scale_min, scale_max):

@@ -118,7 +118,7 @@ def joint_attention(
         check_real("joint_attention", **({} if scale is None else {"scale": scale}))
         check_numbers("joint_attention", **numbers)
     lists = *_lists(table).values(), *_lists(other_table).values()
-    return torch.ops.gsim3d.joint_attention(q, k, v, other_k, other_v, *lists, _scale(q, scale))[0]
+    return call("joint_attention", q, k, v, other_k, other_v, *lists, _scale(q, scale))[0]
 
 
 def _lists(table: PatchTable, prefix: str = "") -> dict[str, Tensor]:

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from gsim3d.errors import NumericalError
 from gsim3d.ops._arguments import check_floating, check_numbers, check_splits, check_tensors
-from gsim3d.ops._register import fakes, register_autocast, register_gradients, save_inputs
+from gsim3d.ops._register import call, fakes, register_autocast, register_gradients, save_inputs
 
 
 def sweep_geometry(
@@ -133,7 +133,7 @@ def plane_sweep(
         check_tensors("plane_sweep", features=features, **geometry, src_images=src_images, cu_src=cu_src)
         check_floating("plane_sweep", features=features)
         check_numbers("plane_sweep", features=features)
-    return torch.ops.gsim3d.plane_sweep(features, homographies, translations, inverse_depths, src_images, cu_src)
+    return call("plane_sweep", features, homographies, translations, inverse_depths, src_images, cu_src)
 
 
 def _costs(features, homographies, translations, inverse_depths, src_images, cu_src):

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.ops._arguments import check_floating, check_numbers, check_real, check_tensors
-from gsim3d.ops._register import fakes, is_narrow, register_autocast, register_gradients, save_inputs
+from gsim3d.ops._register import call, fakes, is_narrow, register_autocast, register_gradients, save_inputs
 
 
 def row_norm(
@@ -40,7 +40,7 @@ def row_norm(
         tensors = {"x": x, "weight": weight, "bias": bias} | ({} if residual is None else {"residual": residual})
         _check("row_norm", tensors, eps)
     dtype = x.dtype if residual is None else residual.dtype
-    return torch.ops.gsim3d.row_norm(x, weight, bias, residual, eps, dtype)[0]
+    return call("row_norm", x, weight, bias, residual, eps, dtype)[0]
 
 
 def residual_norm(
@@ -87,7 +87,7 @@ def residual_norm(
             tensors |= {} if pair is None else {f"{name}[0]": pair[0], f"{name}[1]": pair[1]}
         _check("residual_norm", tensors, eps)
     weights = *(branch_norm or (None, None)), *(norm or (None, None))
-    return torch.ops.gsim3d.residual_norm(x, branch, keep, *weights, eps)[:2]
+    return call("residual_norm", x, branch, keep, *weights, eps)[:2]
 
 
 def _check(op: str, tensors: dict[str, Tensor], eps: float) -> None:
@@ -187,7 +187,7 @@ def norm_gelu(x: Tensor, mean: Tensor, scale: Tensor, bias: Tensor, *, check: bo
         tensors = {"x": x, "mean": mean, "scale": scale, "bias": bias}
         check_tensors("norm_gelu", **tensors)
         check_numbers("norm_gelu", **tensors)
-    return torch.ops.gsim3d.norm_gelu(x, mean, scale, bias, scale.dtype)
+    return call("norm_gelu", x, mean, scale, bias, scale.dtype)
 
 
 def _norm(x, weight, bias, residual, eps, dtype):

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.ops._arguments import check_floating, check_numbers, check_real, check_tensors, check_whole
-from gsim3d.ops._register import fakes, register_autocast, register_gradients
+from gsim3d.ops._register import call, fakes, register_autocast, register_gradients
 
 
 class SpringLists(NamedTuple):
@@ -105,7 +105,7 @@ def advance_springs(
     height = -math.inf if ground is None else ground
     state = torch.stack([positions, velocities])
     scene = (*springs, *numbers.values(), seconds, substeps, height, power)
-    return torch.ops.gsim3d.advance_springs(state, *scene)[0].unbind(0)
+    return call("advance_springs", state, *scene)[0].unbind(0)
 
 
 def _advanced(state, neighbors, *others):
