@@ -223,11 +223,7 @@ def _register(name: str, op: str, backward: Callable, setup: Callable | None, wi
 
         @staticmethod
         def backward(ctx, *grads):
-            if torch.is_grad_enabled():
-                found = backward(ctx, *grads)
-            else:
-                with torch._C._AutoDispatchBelowAutograd():
-                    found = backward(ctx, *grads)
+            found = backward(ctx, *grads)
             return (*found, None) if isinstance(found, tuple) else (found, None)
 
     def kernel(keyset, *inputs):

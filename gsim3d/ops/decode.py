@@ -1,6 +1,5 @@
 """What a network says about the shape and colour of Gaussians -> rotations, scales and colours in the world."""
 
-import torch
 from torch import Tensor
 
 from gsim3d.ops._arguments import check_numbers, check_real, check_tensors, check_whole
@@ -52,7 +51,7 @@ def _decoded(raw, readings, degree, scale_min, scale_max):
 
 
 def _backward(ctx, *grads):
-    grad_raw = torch.ops.gsim3d.decode_gaussians_backward(*grads, *ctx.saved_tensors, *ctx.others)
+    grad_raw = call("decode_gaussians_backward", *grads, *ctx.saved_tensors, *ctx.others)
     return grad_raw, None, None, None, None
 
 

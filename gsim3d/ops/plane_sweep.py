@@ -144,7 +144,7 @@ fakes(plane_sweep=_costs, plane_sweep_backward=lambda grad, features, *_: featur
 
 
 def _backward(ctx, grad):
-    return torch.ops.gsim3d.plane_sweep_backward(grad, *ctx.saved_tensors), None, None, None, None, None
+    return call("plane_sweep_backward", grad, *ctx.saved_tensors), None, None, None, None, None
 
 
 _without = ["homographies", "translations", "inverse_depths"]

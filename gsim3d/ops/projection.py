@@ -288,14 +288,14 @@ def _backward(ctx, means2d, conics, depths, _, compensations):
     pairs = [means.new_zeros(n_pairs, *size) if grad is None else grad for grad, size in given]
     of_viewmats, of_Ks, of_distortion = ctx.needs_input_grad[5:8]
     options = *ctx.options, of_viewmats, of_Ks or of_distortion
-    grads = torch.ops.gsim3d.project_gaussians_backward(*pairs, *saved, *options)
+    grads = call("project_gaussians_backward", *pairs, *saved, *options)
     wanted = (True, *(x is not None for x in saved[2:5]), of_viewmats, of_Ks, of_distortion)
     grads = [grad if want else None for grad, want in zip(grads, wanted, strict=True)]
     return *grads[:4], None, *grads[4:], *[None] * 14  # none of opacities
 
 
 def _sh_backward(ctx, grad):
-    return torch.ops.gsim3d.sh_to_color_backward(grad, *ctx.saved_tensors)
+    return call("sh_to_color_backward", grad, *ctx.saved_tensors)
 
 
 fakes(

@@ -152,7 +152,7 @@ def _backward(ctx, *grads):
     saved, with_absolute = ctx.saved_tensors, ctx.needs_input_grad[7]
     n_features = saved[8].shape[1]
     images = grads_of_images(grads, saved[0], n_features)
-    found = torch.ops.gsim3d.rasterize_projected_backward(*images, *saved, *ctx.options, with_absolute)
+    found = call("rasterize_projected_backward", *images, *saved, *ctx.options, with_absolute)
     *rows, features, background = found
     absolute = features[:, n_features:] if with_absolute else None
     return (*rows, features[:, :n_features], background, absolute, *[None] * 8)

@@ -108,7 +108,7 @@ def _setup(ctx, inputs, output):
 def _backward(ctx, grad, _grad_stats):
     if grad is None:
         return (None,) * 6
-    grad_x, grad_weight, grad_bias = torch.ops.gsim3d.row_norm_backward(grad, *ctx.saved_tensors)
+    grad_x, grad_weight, grad_bias = call("row_norm_backward", grad, *ctx.saved_tensors)
     return grad_x, grad_weight, grad_bias, grad if ctx.has_residual else None, None, None
 
 
@@ -142,7 +142,7 @@ def _residual_backward(ctx, grad_sum, grad_out, *_):
         return (None,) * 8
     saved = ctx.saved_tensors  # read once: a checkpoint gives them once
     branch_weight, weight = saved[3:5]
-    x, branch, _, *of_norms = torch.ops.gsim3d.residual_norm_backward(grad_sum, grad_out, *saved)
+    x, branch, _, *of_norms = call("residual_norm_backward", grad_sum, grad_out, *saved)
     given = [w is not None for w in (branch_weight, branch_weight, weight, weight)]
     return x, branch, None, *(g if has else None for g, has in zip(of_norms, given, strict=True)), None
 
@@ -211,7 +211,7 @@ fakes(
 
 def _gelu_backward(ctx, grad):
     saved = ctx.saved_tensors
-    x, scale, bias = torch.ops.gsim3d.norm_gelu_backward(grad, *saved)
+    x, scale, bias = call("norm_gelu_backward", grad, *saved)
     return x, -saved[2] * bias, scale, bias, None
 
 

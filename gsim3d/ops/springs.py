@@ -125,7 +125,7 @@ def _setup(ctx, inputs, output):
 
 
 def _backward(ctx, grad, _):
-    state, *others = torch.ops.gsim3d.advance_springs_backward(grad, *ctx.saved_tensors, *ctx.others)
+    state, *others = call("advance_springs_backward", grad, *ctx.saved_tensors, *ctx.others)
     return state, *4 * [None], *others, *4 * [None]
 
 

@@ -5,10 +5,12 @@ import math
 
 import pytest
 import torch
+from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode
 
 from gsim3d.cameras import Cameras
 from gsim3d.errors import GradientError, NumericalError
 from gsim3d.ops import project_gaussians, rasterize_gaussians, rasterize_projected, sh_to_color
+from gsim3d.ops._arguments import index_list, offsets
 from gsim3d.ops.projection import lens_limits
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, assert_same_bits_for_any_threads
 from tests.effects.counting import counted
@@ -507,3 +509,42 @@ def test_second_derivatives_are_refused_by_name():
         grad.sum().backward()
     with pytest.raises(GradientError, match="Ks"):
         rasterize_gaussians(*leaves[:3], case.opacities, case.cameras(*leaves[3:]), colors=leaves[0])
+
+
+@pytest.mark.parametrize("n_clouds, n_images", [(2, 4), (3, 3), (1, 2)])
+def test_clouds_of_one_size_equal_lists(n_clouds, n_images, device):
+    case = Case(n=12, device=device)
+    means, quats, scales, *_ = case.leaves
+    n = len(means) // n_clouds * n_clouds
+    rows = means[:n], quats[:n], scales[:n]
+    viewmats, Ks = (x[torch.arange(n_images, device=x.device) % 3] for x in case.leaves[3:5])
+    owners = torch.arange(n_clouds, device=device).repeat_interleave(n_images // n_clouds)
+    zeros = torch.zeros(n_images, device=device)
+    cameras = Cameras(viewmats, Ks, zeros, zeros, owners, 45, 37)
+    cu_rows = torch.arange(n_clouds + 1, device=device) * (n // n_clouds)
+    expected = project_gaussians(*rows, cameras, cu_rows=cu_rows, n_pairs=n_images * n // n_clouds)
+    unknown = dataclasses.replace(cameras, image_cloud=torch.full_like(owners, 7))
+    for _ in range(2):
+        for actual, wanted in zip(project_gaussians(*rows, unknown, n_clouds=n_clouds), expected, strict=True):
+            assert_same_bits(actual, wanted)
+
+
+def test_clouds_that_are_not_of_one_size_raise():
+    case = Case(n=40)
+    means, quats, scales, viewmats, Ks = case.leaves
+    cameras, lists = case.cameras(viewmats, Ks), case.cu_rows
+    for n_clouds, cu_rows in ((2, None), (3, None), (0, None), (-1, None), (1, lists)):
+        with pytest.raises(ValueError, match=r"n_clouds must divide N=\d+ rows and I=3 images, and stand in place"):
+            project_gaussians(means, quats, scales, cameras, cu_rows=cu_rows, n_clouds=n_clouds)
+
+
+def test_kept_lists_are_those_of_their_sizes():
+    device = torch.device("cpu")
+    assert index_list(offsets, 3, 5, device=device).tolist() == [0, 5, 10, 15]
+    assert index_list(offsets, 3, 5, device=device) is index_list(offsets, 3, 5, device=device)
+    assert index_list(offsets, 3, 4, device=device).tolist() == [0, 4, 8, 12]
+    with torch.inference_mode():
+        assert not index_list(offsets, 2, 9, device=device).is_inference()
+    with FakeTensorMode():
+        assert isinstance(index_list(offsets, 6, 7, device=device), FakeTensor)
+    assert not isinstance(index_list(offsets, 6, 7, device=device), FakeTensor)
