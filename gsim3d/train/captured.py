@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import dataclasses
 import gc
+import itertools
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
-from functools import partial
 from itertools import chain
 from typing import Any
 
@@ -93,6 +93,8 @@ class CapturedLoss:
         precision: function that returns the autocast context of a part ("encoder", "dynamics", "renderer").
         recompute: see TrainConfig.
         leaves_out: see ``leave_one_out`` of DataConfig.
+        whole: the loss compares images of different steps. Otherwise each segment of a rollout (``Batch.cut``) has its
+            backward pass before the next one begins, so that memory is that of the longest segment.
 
     Attributes:
         parameters: all parameters of the simulator, in the order of the gradients returned.
@@ -112,10 +114,11 @@ class CapturedLoss:
         precision: Callable[[str], torch.autocast],
         recompute: Collection[str] = (),
         leaves_out: bool = False,
+        whole: bool = False,
     ):
         check_capturable(simulator.config.dynamics)
         self.simulator, self.plan, self.loss, self.precision = simulator, plan, loss, precision
-        self.again, self.leaves_out = recomputing(recompute, simulator), leaves_out
+        self.again, self.leaves_out, self.whole = recomputing(recompute, simulator), leaves_out, whole
         self.parameters = list(simulator.parameters())
         self.alone: AbstractContextManager = nullcontext()
         self.meanwhile: Callable[[], None] = lambda: None
@@ -257,65 +260,99 @@ class _Step:
             state = owner.again("encoder")(encode)(self._context)
         return with_views(state, self._context, self._shapes) if owner.leaves_out else state
 
-    def _rollout(
+    def _segments(
         self,
         state: Particles,
         geometry: Callable[[Particles], Pyramid],
         report: StabilityReport,
         wrap: Callable[[Callable], Callable] | None = None,
-    ) -> list[Particles]:
-        """Returns the simulated steps; ``wrap`` as in Simulator.rollout."""
+    ) -> Iterator[list[Particles]]:
+        """Yields the simulated steps of each segment; ``wrap`` as in Simulator.rollout."""
         owner, plan = self._owner, self._owner.plan
-        if not self._n_future:
-            return []
-        if plan.spec.dynamics.background == "masked_out":
+        if self._n_future and plan.spec.dynamics.background == "masked_out":
             left_out, plan = state.activity != DYNAMIC, of_prepared_state(plan)  # the number of particles stays
             hidden = {"activity": torch.where(left_out, ASLEEP, state.activity)}
             state = dataclasses.replace(state, opacities=torch.where(left_out, 0.0, state.opacities), **hidden)
-        else:
+        elif self._n_future:
             state = owner.simulator._prepare(state, plan)
         state = displaced(state, self._noise, owner.simulator.config.dynamics.grid_size)
-        rollout = partial(owner.simulator.rollout, plan=plan, geometry=geometry, report=report, on_invalid="drop")
-        with owner.precision("dynamics"):
-            return in_segments(partial(rollout, wrap=wrap), state, self._n_future, self._cut)
+
+        def rollout(state: Particles, n_steps: int) -> list[Particles]:
+            given = {"geometry": geometry, "report": report, "on_invalid": "drop", "wrap": wrap}
+            with owner.precision("dynamics"):
+                return owner.simulator.rollout(state, n_steps, plan=plan, **given)
+
+        return in_segments(rollout, state, self._n_future, self._cut)
 
     def _compute(self, geometry: Callable[[Particles], Pyramid], report: StabilityReport) -> tuple:
-        owner, dynamics, of_calls = self._owner, self._owner.simulator.dynamics, []
+        owner, dynamics, of_calls, n_calls = self._owner, self._owner.simulator.dynamics, [], itertools.count(1)
         geometry = _OfCalls(geometry)
 
         def with_own_weights(predict: Callable[[Particles], Particles]) -> Callable[[Particles], Particles]:
             def call(state: Particles) -> Particles:
                 with _replaced(dynamics.modules(), _aliases) as aliases:
                     of_calls.append(aliases)
-                    return owner.again("steps")(geometry.in_call(len(of_calls), predict))(state)
+                    return owner.again("steps")(geometry.in_call(next(n_calls), predict))(state)
 
             return call
 
         state = self._encode(report)
-        particles = concatenate([state, *self._rollout(state, geometry, report, with_own_weights)])
+        segments = self._segments(state, geometry, report, with_own_weights)
+        if owner.whole:
+            segments = iter([list(chain.from_iterable(segments))])
+        once = [*owner.simulator.encoder.parameters(), *owner.simulator.renderer.parameters()]
+        losses, errors, total = [], [], [None] * (len(once) + len(list(dynamics.parameters())))
+        begin, steps = 0, [state, *next(segments, [])]
+        while steps:
+            particles = concatenate(steps)
+            end = begin + particles.n_clouds // len(self._targets.origin)
+            loss, wrong = self._loss(particles, begin, end, report)
+            gradients = torch.autograd.grad(loss, [*once, *chain.from_iterable(of_calls)], allow_unused=True)
+            n = len(total) - len(once)
+            by_call = [gradients[first : first + n] for first in range(len(once), len(gradients), n)]
+            found = [*gradients[: len(once)], *(_sums(by_call[::-1]) if by_call else [None] * n)]
+            total = _sums([total, found])
+            losses.append(loss.detach())
+            errors.append(wrong)
+            of_calls.clear()
+            report.is_closed = False
+            begin, steps = end, next(segments, [])
+        report.close()
+        known = dict(zip([*once, *dynamics.parameters()], total, strict=True))
+        gradients = tuple(
+            None if (gradient := known.get(parameter)) is None else laid_out_as(parameter, gradient)
+            for parameter in owner.parameters
+        )
+        return sum(losses[1:], losses[0]), torch.cat(errors), gradients
+
+    def _loss(self, particles: Particles, begin: int, end: int, report: StabilityReport) -> tuple[Tensor, Tensor]:
+        """Loss and errors of the steps from ``begin`` to ``end`` of the window; closes the report, since recomputation
+        in the backward pass must not count again."""
+        owner, targets = self._owner, self._targets_of(begin, end)
         with owner.precision("renderer"):
             shown = {"plan": owner.plan, "report": report, "on_invalid": "drop"}
             draw = owner.again("images")(
                 lambda p, cameras, valid: owner.simulator._draw(p, cameras, active=valid, **shown).color
             )
             if owner.leaves_out:
-                images = draw_left_out(draw, particles, self._targets, images_per_cloud(self._context))
+                images = draw_left_out(draw, particles, targets, images_per_cloud(self._context))
             else:
-                images = draw(particles, self._targets.cameras, self._targets.valid)
-        report.close()  # recomputation in the backward pass must not count again
-        loss, errors = owner.loss(images, self._targets, self._weights)
-        once = [*owner.simulator.encoder.parameters(), *owner.simulator.renderer.parameters()]
-        gradients = torch.autograd.grad(loss, [*once, *chain.from_iterable(of_calls)], allow_unused=True)
-        known = dict(zip(once, gradients))
-        if of_calls:
-            n = len(of_calls[0])
-            by_call = [gradients[begin : begin + n] for begin in range(len(once), len(gradients), n)]
-            known |= zip(dynamics.parameters(), _sums(by_call[::-1]), strict=True)
-        gradients = tuple(
-            None if (gradient := known.get(parameter)) is None else laid_out_as(parameter, gradient)
-            for parameter in owner.parameters
-        )
-        return loss.detach(), errors, gradients
+                images = draw(particles, targets.cameras, targets.valid)
+        report.close()
+        return owner.loss(images, targets, self._weights[begin:end])
+
+    def _targets_of(self, begin: int, end: int) -> Frames:
+        """The target images of the steps from ``begin`` to ``end`` of each scene's window."""
+        targets, n_steps = self._targets, len(self._weights)
+        if end - begin == n_steps:
+            return targets
+        number = torch.arange(len(targets.cameras), device=self._weights.device)
+        chosen = number.view(len(targets.origin), n_steps, -1)[:, begin:end].flatten()
+        n_clouds = len(targets.origin) * (end - begin)
+        shows = number[: len(chosen)] // (len(chosen) // n_clouds)
+        fields = {name: getattr(targets, name) for name in ("images", "dynamic", "valid")}
+        fields = {name: None if value is None else value[chosen] for name, value in fields.items()}
+        return dataclasses.replace(targets, cameras=targets.cameras.select(chosen, shows), **fields)
 
     @torch.no_grad()
     def _observed(self) -> list[PyramidCapacity]:
@@ -323,7 +360,7 @@ class _Step:
         geometry, needed = observing_geometry(self._owner.simulator.dynamics, FACTOR)
         if self._n_future:
             with self._owner.simulator.dynamics.moving_at_most(self.moving):
-                self._rollout(self._encode(StabilityReport()), geometry, StabilityReport())
+                list(self._segments(self._encode(StabilityReport()), geometry, StabilityReport()))
         return needed
 
     def _given(self, report: StabilityReport) -> tuple:

@@ -18,14 +18,12 @@ from gsim3d.state import Particles
 
 def in_segments(
     rollout: Callable[[Particles, int], list[Particles]], state: Particles, n_steps: int, cut: int
-) -> list[Particles]:
-    """Rolls out ``n_steps`` steps with truncated backpropagation: gradients flow through ``cut`` steps (0: all)."""
-    steps = []
-    while len(steps) < n_steps:
-        segment = rollout(state, min(cut or n_steps, n_steps - len(steps)))
-        state = concatenate([state, *segment]).detach()
-        steps += segment
-    return steps
+) -> Iterator[list[Particles]]:
+    """Yields ``n_steps`` simulated steps in segments of ``cut`` (0: one), through each of which gradients flow."""
+    while n_steps:
+        segment = rollout(state, min(cut or n_steps, n_steps))
+        state, n_steps = concatenate([state, *segment]).detach(), n_steps - len(segment)
+        yield segment
 
 
 def recomputing(parts: Collection[str], module: nn.Module) -> Callable[..., Callable[[Callable], Callable]]:

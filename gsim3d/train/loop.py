@@ -139,7 +139,7 @@ class Trainer:
 
     def _capture(self) -> CapturedLoss:
         precision = partial(self.config.precision.of, device=self.device)
-        parts = self.config.recompute, self.config.data.leave_one_out
+        parts = self.config.recompute, self.config.data.leave_one_out, self.config.loss.image_gain
         return CapturedLoss(self.simulator, self.plan, self.loss_of_images, precision, *parts)
 
     # ---- the loop ----
@@ -418,7 +418,8 @@ class Trainer:
                 begin = simulator._prepare(particles, self.plan)
                 begin = displaced(begin, batch.noise, simulator.config.dynamics.grid_size)
                 given = {"plan": self.plan, "generator": noise, "wrap": again("steps", noise), **options}
-                steps = in_segments(partial(simulator.rollout, **given), begin, batch.n_future, batch.cut)
+                segments = in_segments(partial(simulator.rollout, **given), begin, batch.n_future, batch.cut)
+                steps = [step for segment in segments for step in segment]
             if self._is_logged:
                 watch.follow(steps)
             particles = concatenate([particles, *steps])

@@ -175,6 +175,22 @@ def test_captured_gradients_equal_autograd(phase, scenes, trainer, device):
     assert captured.captures >= 1 and not report.total
 
 
+@pytest.mark.parametrize("trainer", ["latent"], indirect=True)
+@pytest.mark.parametrize("whole, expected", [(False, "ffbfb"), (True, "fffb")])
+def test_a_segment_has_its_backward_pass_before_the_next(whole, expected, scenes, trainer, device, monkeypatch):
+    captured = captured_loss(trainer)
+    captured.whole, events, grad = whole, [], torch.autograd.grad
+    batch = batches(scenes, 1, horizon=3, cut=2)[0].to(device)
+    run(captured, batch, trainer)
+    monkeypatch.setattr(torch.autograd, "grad", lambda *a, **k: (events.append("b"), grad(*a, **k))[1])
+    trainer.simulator.dynamics.register_forward_pre_hook(
+        lambda *_: events.append("f") if torch.is_grad_enabled() else None
+    )
+    captured._steps.clear()
+    run(captured, batch, trainer)
+    assert "".join(events)[-len(expected) :] == expected
+
+
 @pytest.mark.parametrize(
     "phase, trainer",
     [({}, "latent"), ({"horizon": 3, "cut": 2}, "flying")],
