@@ -6,7 +6,6 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from gsim3d import ops
 from gsim3d.cameras import Cameras
@@ -77,7 +76,7 @@ class GaussianHead(nn.Module):
     def _shape_and_color(self, particles: Particles, n_harmonics: int) -> tuple[Tensor | None, Tensor, Tensor]:
         if self.config.latents == 0:
             return particles.sh[:, :n_harmonics] if n_harmonics else None, particles.quats, particles.scales
-        hidden, K = F.gelu(self.fc1(particles.latents)), self.config.n_harmonics
+        hidden, K = self.fc1(particles.latents, gelu=True), self.config.n_harmonics
         if n_harmonics == K:
             raw = self.fc2(hidden)
         else:

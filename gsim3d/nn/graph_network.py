@@ -113,7 +113,7 @@ class Perceptron(nn.Module):
 
     def forward(self, x: Tensor, residual: Tensor | None = None) -> Tensor:
         x = F.pad(x, (0, self.fc1.in_features - x.shape[1]))
-        return widened(self.norm(self.fc2(F.gelu(self.fc1(x))), residual))
+        return widened(self.norm(self.fc2(self.fc1(x, gelu=True)), residual))
 
 
 class Interaction(nn.Module):

@@ -20,12 +20,39 @@ from gsim3d.ops.streams import Streams
 MIN_ROWS = 16  # matrix products of fewer rows go through other code in BLAS, which rounds differently
 
 
-def row_linear(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
-    """``F.linear`` of [N, C]."""
+def linear(x: Tensor, weight: Tensor, bias: Tensor | None, *, gelu: bool = False) -> Tensor:
+    """``F.linear``, or ``F.gelu`` of it; in float32 on the CPU by oneDNN, which is faster than BLAS on some."""
+    one_dnn = x.is_cpu and x.dtype == weight.dtype == torch.float32 and torch.backends.mkldnn.is_available()
+    if not one_dnn or torch.is_autocast_enabled("cpu") or torch.compiler.is_compiling():
+        out = F.linear(x, weight, bias)
+    elif torch.is_grad_enabled():
+        out = _OneDnnLinear.apply(x, weight, bias)
+    else:
+        return torch.ops.mkldnn._linear_pointwise(x, weight, bias, "gelu" if gelu else "none", [], "none")
+    return F.gelu(out) if gelu else out
+
+
+class _OneDnnLinear(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x, weight, bias):
+        ctx.save_for_backward(x, weight)
+        return linear(x, weight, bias)
+
+    @staticmethod
+    def backward(ctx, grad):
+        (x, weight), (for_x, for_weight, for_bias) = ctx.saved_tensors, ctx.needs_input_grad
+        rows = grad.flatten(0, -2)
+        grad_x = linear(grad, weight.t(), None) if for_x else None
+        grad_weight = rows.t() @ x.flatten(0, -2) if for_weight else None
+        return grad_x, grad_weight, rows.sum(0) if for_bias else None
+
+
+def row_linear(x: Tensor, weight: Tensor, bias: Tensor | None, *, gelu: bool = False) -> Tensor:
+    """:func:`linear` of [N, C]."""
     n_rows = x.shape[0]
     if n_rows >= MIN_ROWS:
-        return F.linear(x, weight, bias)
-    return F.linear(F.pad(x, (0, 0, 0, MIN_ROWS - n_rows)), weight, bias)[:n_rows]
+        return linear(x, weight, bias, gelu=gelu)
+    return linear(F.pad(x, (0, 0, 0, MIN_ROWS - n_rows)), weight, bias, gelu=gelu)[:n_rows]
 
 
 def linear_grad_weight(grad: Tensor, x: Tensor) -> Tensor:
@@ -34,14 +61,23 @@ def linear_grad_weight(grad: Tensor, x: Tensor) -> Tensor:
     return grad.t() @ x if wide == grad.dtype else torch.mm(grad.t(), x, out_dtype=wide)
 
 
+class Linear(nn.Linear):
+    """``nn.Linear``, by :func:`linear`."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return linear(x, self.weight, self.bias)
+
+
 class RowLinear(nn.Linear):
     """``nn.Linear`` of [N, C]."""
 
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(self, x: Tensor, *, gelu: bool = False) -> Tensor:
+        """``gelu``: with ``F.gelu`` behind it."""
         if not x.is_cuda or torch.compiler.is_compiling() or self.bias is None:
-            return row_linear(x, self.weight, self.bias)
+            return row_linear(x, self.weight, self.bias, gelu=gelu)
         x = x.to(product_dtype(x))
-        return _RowLinear.apply(x, self.weight, self.bias, *rounded_weights(self, x.dtype))
+        out = _RowLinear.apply(x, self.weight, self.bias, *rounded_weights(self, x.dtype))
+        return F.gelu(out) if gelu else out
 
     def some(self, x: Tensor, outputs: Sequence[tuple[int, int]]) -> Tensor:
         """The channels in ``outputs``, (first, one behind the last) of each run; the others are not computed."""

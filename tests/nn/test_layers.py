@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch.nn import functional as F
 
 from gsim3d.nn.layers import (
     RowBatchNorm,
@@ -29,6 +30,21 @@ def test_rows_do_not_depend_on_the_rows_beside_them(n):
     torch.manual_seed(0)
     for layer in (RowLinear(24, 40), RowLayerNorm(24), RowBatchNorm(24).eval()):
         assert_same_bits(layer(rows(300)[:n].clone()), layer(rows(300))[:n], type(layer).__name__)
+
+
+@pytest.mark.parametrize("gelu", [False, True])
+def test_linear_is_torchs(gelu):
+    torch.manual_seed(0)
+    layer, x, results = RowLinear(24, 40), rows(50).requires_grad_(), []
+    parameters = (x, layer.weight, layer.bias)
+    for y in (layer(x, gelu=gelu), F.gelu(F.linear(*parameters)) if gelu else F.linear(*parameters)):
+        first = torch.autograd.grad(y.square().sum(), parameters, create_graph=True)
+        second = torch.autograd.grad(sum(g.square().sum() for g in first), parameters)
+        results.append((y, *first, *second))
+    for ours, theirs in zip(*results, strict=True):
+        assert_close_relative_to_max(ours, theirs, 1e-5)
+    with torch.no_grad():
+        assert_same_bits(layer(x, gelu=gelu), results[0][0].detach())
 
 
 def test_layer_norm_is_torchs():

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from gsim3d.nn.layers import RowLayerNorm, widened
+from gsim3d.nn.layers import Linear, RowLayerNorm, widened
 from gsim3d.nn.multiview_encoder.config import EncoderConfig
 
 MASKED = -100.0  # added to the score of a masked pair; finite, so that a softmax over masked keys alone is finite
@@ -74,13 +74,13 @@ class Attention(nn.Module):
 
     def __init__(self, dim: int, mlp_dim: int = 0):
         super().__init__()
-        self.q_proj = nn.Linear(dim, dim, bias=False)
-        self.k_proj = nn.Linear(dim, dim, bias=False)
-        self.v_proj = nn.Linear(dim, dim, bias=False)
-        self.merge = nn.Linear(dim, dim, bias=False)
+        self.q_proj = Linear(dim, dim, bias=False)
+        self.k_proj = Linear(dim, dim, bias=False)
+        self.v_proj = Linear(dim, dim, bias=False)
+        self.merge = Linear(dim, dim, bias=False)
         self.norm1 = RowLayerNorm(dim)
         if mlp_dim:
-            layers = nn.Linear(2 * dim, mlp_dim, bias=False), nn.GELU(), nn.Linear(mlp_dim, dim, bias=False)
+            layers = Linear(2 * dim, mlp_dim, bias=False), nn.GELU(), Linear(mlp_dim, dim, bias=False)
             self.mlp = nn.Sequential(*layers)
             self.norm2 = RowLayerNorm(dim)
         else:
