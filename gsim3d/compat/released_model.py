@@ -26,6 +26,7 @@ from gsim3d.math.spherical_harmonics import degree_damping, rotate_harmonics, sh
 from gsim3d.nn import point_transformer
 from gsim3d.nn.gaussian_head import GaussianHead
 from gsim3d.nn.layers import widened
+from gsim3d.nn.multiview_encoder.crops import Crops
 from gsim3d.nn.multiview_encoder.depth import CostVolume, Depth, DepthPredictor, Views
 from gsim3d.nn.multiview_encoder.heads import ParticleHeads, PixelParticles, PixelRays, unit_vectors
 from gsim3d.nn.multiview_encoder.transformer import MultiViewTransformer
@@ -115,11 +116,11 @@ class ReleasedHeads(ParticleHeads):
     """Particles are placed at depth along the ray, although the plane sweep predicts z; Pluecker moments are about the
     world origin; harmonics are rotated by :func:`rotate_released_harmonics`."""
 
-    def forward(self, depth: Depth, views: Views, origin: Tensor) -> PixelParticles:
-        return super().forward(depth, views, torch.zeros_like(origin))
+    def forward(self, depth: Depth, views: Views, origin: Tensor, crops: Crops | None = None) -> PixelParticles:
+        return super().forward(depth, views, torch.zeros_like(origin), crops)
 
-    def _rays(self, geometry: PixelRays, raw_offset: Tensor) -> Tensor:
-        return unit_vectors(super()._rays(geometry, raw_offset))
+    def _rays(self, geometry: PixelRays, raw_offset: Tensor, corners: Tensor | None = None) -> Tensor:
+        return unit_vectors(super()._rays(geometry, raw_offset, corners))
 
     def rotate_harmonics(self, sh: Tensor, rotations: Tensor) -> Tensor:
         return rotate_released_harmonics(sh, rotations)

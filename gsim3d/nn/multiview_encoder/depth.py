@@ -44,6 +44,7 @@ class Depth:
     depth: Tensor  #: [I, 1, H, W] metres
     opacity_logit: Tensor  #: [I, 1, H, W]
     features: Tensor  #: [I, F, H, W] for the heads
+    corners: Tensor | None = None  #: int64 [I, 2], row and column of the first pixel; None: 0
 
 
 def upsampling_matrix(n: int, factor: int, stride: float, like: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from gsim3d.nn.layers import tf32_only_if_asked
 from gsim3d.nn.multiview_encoder.checks import check_frames
 from gsim3d.nn.multiview_encoder.cnn import CNN
 from gsim3d.nn.multiview_encoder.config import EncoderConfig
+from gsim3d.nn.multiview_encoder.crops import Crops
 from gsim3d.nn.multiview_encoder.depth import Depth, DepthPredictor, Views
 from gsim3d.nn.multiview_encoder.heads import ParticleHeads, PixelParticles, PixelRays
 from gsim3d.nn.multiview_encoder.static_shapes import PixelIndex, StaticShapes, ViewGeometry
@@ -158,18 +159,22 @@ class Encoder(nn.Module):
         n_views = torch.bincount(image_cloud, minlength=frames.cloud_scene.shape[0])
         order = torch.argsort(image_cloud, stable=True)
         groups = {count: order[n_views[image_cloud[order]] == count] for count in n_views.unique().tolist() if count}
+        crops = None if frames.masks is None or frames.images.is_cuda else Crops.around(frames.masks)
         parts = []
         for count, images in groups.items():
             features = None if frames.backbone_features is None else frames.backbone_features[images]
             of_images = {"images": frames.images[images], "backbone_features": features}
             chosen = dataclasses.replace(frames, **of_images, cameras=frames.cameras.select(images))
-            parts.append(self._predict(_views(chosen, count), frames.origin[_scene_of_image(chosen)]))
+            views, origin = _views(chosen, count), frames.origin[_scene_of_image(chosen)]
+            parts.append(self._predict(views, origin, None if crops is None else crops[images]))
+        if crops is not None:
+            frames = dataclasses.replace(frames, **{k: crops.cut(getattr(frames, k)) for k in ("masks", "dynamic")})
         place = torch.cat(list(groups.values())).argsort()[order] if len(groups) > 1 else None
         return self._assemble(frames, parts, place, order, n_views)
 
-    def _predict(self, views: Views, origin: Tensor) -> PixelParticles:
+    def _predict(self, views: Views, origin: Tensor, crops: Crops | None = None) -> PixelParticles:
         """origin: [I, 3], of the scene that each image shows."""
-        return self.heads(self._depth(views), views, origin)
+        return self.heads(self._depth(views), views, origin, crops)
 
     def _depth(self, views: Views) -> Depth:
         if self.config.backbone == "vit_dpt":
@@ -182,7 +187,7 @@ class Encoder(nn.Module):
         self, frames: Frames, parts: list[PixelParticles], place: Tensor | None, order: Tensor, n_views: Tensor
     ) -> Particles:
         """Particles without masked pixels; the images of ``order`` lie at ``place`` among those of ``parts``."""
-        n_pixels = frames.images.shape[2] * frames.images.shape[3]
+        n_pixels = parts[0].means.shape[1]
         kept, index, place_of_pixel, per_image = None, None, None, torch.full_like(order, n_pixels)
         if frames.masks is not None:
             kept = frames.masks[order].flatten()

@@ -12,6 +12,7 @@ from gsim3d.math.rotations import quat_product, rotation_to_quat, unit_quats, wi
 from gsim3d.math.spherical_harmonics import degree_damping, rotate_harmonics
 from gsim3d.nn.layers import widened
 from gsim3d.nn.multiview_encoder.config import EncoderConfig
+from gsim3d.nn.multiview_encoder.crops import Crops
 from gsim3d.nn.multiview_encoder.depth import Depth, Views
 from gsim3d.nn.multiview_encoder.layout import for_convolution, two_convolutions
 
@@ -29,11 +30,15 @@ class PixelRays:
         poses = torch.linalg.inv(views.viewmats)
         return cls(poses[:, :3, 3], poses[:, :3, :3], torch.linalg.inv(views.Ks))
 
-    def directions(self, height: int, width: int, offset: Tensor) -> Tensor:
-        """[I, 3, H, W] world directions of z-depth 1 through pixel centres + ``offset`` [I or 1, 2, H, W] pixels."""
+    def directions(self, height: int, width: int, offset: Tensor, corners: Tensor | None = None) -> Tensor:
+        """[I, 3, H, W] world directions of z-depth 1 through pixel centres + ``offset`` [I or 1, 2, H, W] pixels, from
+        the pixels ``corners`` on."""
         ticks = (torch.arange(n, device=offset.device) + 0.5 for n in (height, width))
         v, u = torch.meshgrid(*ticks, indexing="ij")
-        x, y = (offset + torch.stack([u, v]).to(offset.dtype)).split(1, 1)
+        centers = torch.stack([u, v]).to(offset.dtype)
+        if corners is not None:
+            centers = centers + corners.flip(1)[:, :, None, None]
+        x, y = (offset + centers).split(1, 1)
         to_world = (self.rotations @ self.inverse_Ks).to(offset.dtype)[:, :, :, None, None]
         return to_world[:, :, 0] * x + to_world[:, :, 1] * y + to_world[:, :, 2]
 
@@ -91,30 +96,33 @@ class ParticleHeads(nn.Module):
         self.conditioning = Conditioning(config.condition_dim, dim) if n_latents else None
         self.to_latents = nn.Conv2d(dim, n_latents, 3, 1, 1) if n_latents else None
 
-    def forward(self, depth: Depth, views: Views, origin: Tensor) -> PixelParticles:
-        """origin: [I, 3] world point from which the moments of viewing rays are taken."""
+    def forward(self, depth: Depth, views: Views, origin: Tensor, crops: Crops | None = None) -> PixelParticles:
+        """origin: [I, 3] world point from which the moments of viewing rays are taken; ``crops``: pixels to compute."""
+        opacities = depth.opacity_logit.sigmoid()
+        if crops is not None:
+            depth, opacities = crops.cut_depth(depth), crops.cut(opacities)
         geometry = PixelRays.of(views) if views.geometry is None else views.geometry.rays
         raw = widened(self.to_gaussians(depth.features))
         raw_offset = raw[:, :2]
-        means = geometry.centers.to(raw.dtype)[:, :, None, None] + depth.depth * self._rays(geometry, raw_offset)
+        rays = self._rays(geometry, raw_offset, depth.corners)
+        means = geometry.centers.to(raw.dtype)[:, :, None, None] + depth.depth * rays
         latents = self._latents(depth, raw_offset, geometry, geometry.centers - origin)
         dynamic, static = latents.split([self.config.dynamic_dim, self.config.static_dim], -1)
         explicit = self.explicit_gaussians(raw[:, 2:], depth.depth, geometry) if self.config.explicit else {}
-        opacities = _rows(depth.opacity_logit.sigmoid())[..., 0]
-        return PixelParticles(_rows(means), opacities, dynamic, static, **explicit)
+        return PixelParticles(_rows(means), _rows(opacities)[..., 0], dynamic, static, **explicit)
 
     def _latents(self, depth: Depth, raw_offset: Tensor, geometry: PixelRays, centers: Tensor) -> Tensor:
         n_images, _, height, width = depth.depth.shape
         if self.to_latents is None:
             return depth.depth.new_zeros(n_images, height * width, 0)
-        central = geometry.directions(height, width, raw_offset.new_zeros(1, 2, height, width))
+        central = geometry.directions(height, width, raw_offset.new_zeros(1, 2, height, width), depth.corners)
         rays = pluecker(centers, central)
         features = self.conditioning(depth.features, depth.depth, depth.opacity_logit, raw_offset, rays)
         latents = _rows(widened(self.to_latents(features)))
         return latents if self.config.latent_limit is None else _within(latents, self.config.latent_limit)
 
-    def _rays(self, geometry: PixelRays, raw_offset: Tensor) -> Tensor:
-        return geometry.directions(*raw_offset.shape[-2:], raw_offset.sigmoid() - 0.5)
+    def _rays(self, geometry: PixelRays, raw_offset: Tensor, corners: Tensor | None = None) -> Tensor:
+        return geometry.directions(*raw_offset.shape[-2:], raw_offset.sigmoid() - 0.5, corners)
 
     def explicit_gaussians(self, raw: Tensor, depth: Tensor, geometry: PixelRays) -> dict[str, Tensor]:
         """quats, scales and sh of the explicit variant, predicted in the camera frame and turned into the world."""

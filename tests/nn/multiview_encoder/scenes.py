@@ -43,16 +43,17 @@ def look_at(angle: float) -> torch.Tensor:
     return pose
 
 
-def make_frames(clouds: list[int], n_clouds: int | None = None, seed: int = 0) -> Frames:
+def make_frames(clouds: list[int], n_clouds: int | None = None, seed: int = 0, size: int = SIZE) -> Frames:
     """One image for every entry of ``clouds``, which names its cloud."""
     n = len(clouds)
     generator = torch.Generator().manual_seed(seed)
     viewmats = torch.stack([look_at(0.4 + 1.1 * i) for i in range(n)])
     K = torch.tensor([[18.0, 0.0, 8.3], [0.0, 17.0, 7.6], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    K[:2] *= size / SIZE
     near, far = torch.full((n,), 1.5), torch.full((n,), 6.0)
-    cameras = Cameras(viewmats, K.repeat(n, 1, 1), near, far, torch.tensor(clouds), SIZE, SIZE)
+    cameras = Cameras(viewmats, K.repeat(n, 1, 1), near, far, torch.tensor(clouds), size, size)
     n_clouds = n_clouds or max(clouds) + 1
-    images = torch.rand(n, 3, SIZE, SIZE, generator=generator)
+    images = torch.rand(n, 3, size, size, generator=generator)
     origin = torch.tensor([[-2.0, -2.0, -0.5]], dtype=torch.float64)
     return Frames(images, cameras, torch.zeros(n_clouds, dtype=torch.int64), torch.arange(n_clouds), origin)
 

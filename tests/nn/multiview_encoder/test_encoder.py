@@ -14,6 +14,7 @@ from gsim3d.errors import InputError, NumericalError
 from gsim3d.math.rotations import quat_product, rotation_matrices, rotation_to_quat, unit_quats
 from gsim3d.math.spherical_harmonics import rotate_harmonics
 from gsim3d.nn.multiview_encoder import Encoder, EncoderConfig, pixel_rows
+from gsim3d.nn.multiview_encoder.crops import Crops
 from gsim3d.nn.multiview_encoder.depth import CostVolume, DepthPredictor, Views, upsampling_matrix
 from gsim3d.nn.multiview_encoder.heads import ParticleHeads, PixelRays
 from gsim3d.state import ASLEEP, DYNAMIC, FROZEN
@@ -161,6 +162,17 @@ def test_masks_drop_pixels_and_dynamic_sets_activity():
     expected = torch.where(dynamic[order].flatten()[kept], DYNAMIC, FROZEN)
     assert torch.equal(particles.activity.long(), expected)
     assert everything.activity.eq(DYNAMIC).all()
+
+
+def test_particles_of_small_masks_have_the_bits_of_whole_images():
+    frames, masks = make_frames([0, 0, 1], size=40), torch.zeros(3, 40, 40, dtype=torch.bool)
+    masks[0, 20, 3], masks[1, :9, -7:], masks[1, 11, 32] = True, True, True
+    encoder = make_encoder()
+    everything, particles = encoder(frames), encoder(dataclasses.replace(frames, masks=masks))
+    for name in ROW_FIELDS:
+        assert_same_bits(getattr(particles, name), getattr(everything, name)[masks.flatten()])
+    crops = Crops.around(masks)
+    assert crops.size == (24, 24) and torch.equal(crops.cut(masks).sum((1, 2)), masks.sum((1, 2)))
 
 
 def test_gradients_are_finite_and_reach_every_parameter():
