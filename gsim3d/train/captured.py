@@ -25,7 +25,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.modules.conv import _ConvNd
 
 from gsim3d.cameras import Frames, TensorRecord
-from gsim3d.cuda_graphs import Captured, fit, fixed_geometry, observing_geometry, of_prepared_state
+from gsim3d.cuda_graphs import Captured, fit, fixed_geometry, of_prepared_state
 from gsim3d.dynamics import DynamicsConfig, concatenate
 from gsim3d.effects.plan import Plan
 from gsim3d.errors import CaptureError, InputError
@@ -41,8 +41,8 @@ from gsim3d.train.gradients import in_segments, recomputing
 from gsim3d.train.left_out import draw_left_out, images_per_cloud, with_views
 from gsim3d.train.samples import Batch, displaced
 
-FACTOR = 1.5  # geometry capacity over the observed size; smaller causes more captures, larger makes steps slower
-PARTICLES_FACTOR = 1.15  # capacity of a cloud over the observed number of particles
+# Capacity of geometry and clouds over the largest size so far: smaller causes more captures, larger makes steps slower.
+FACTOR, PARTICLES_FACTOR = 1.1, 1.05
 PARTICLES_UNIT = 256  # cloud capacities are multiples of it
 MOST_KINDS = 4  # graphs kept at a time
 
@@ -103,7 +103,7 @@ class CapturedLoss:
         captures: number of captured graphs.
         most_particles: largest number of particles of a cloud so far.
         most_moving: largest number of movable particles of a cloud so far.
-        most: largest geometry sizes of any simulated step so far, by (scenes, steps) of the encoded clouds.
+        most: largest geometry sizes that any simulated step needed so far, by (scenes, steps) of the encoded clouds.
     """
 
     def __init__(
@@ -131,20 +131,22 @@ class CapturedLoss:
     def needed(self) -> dict[str, Any]:
         """``most_particles``, ``most_moving`` and ``most`` as JSON values, for :meth:`reserve`."""
         geometry = [[*map(list, clouds), list(sizes)] for clouds, sizes in self.most.items()]
-        return {"rows": self.most_particles, "moving": self.most_moving, "geometry": geometry}
+        return {"rows": self.most_particles, "moving": self.most_moving, "geometry": geometry, "margin": 1}
 
     def reserve(self, needed: dict[str, Any]) -> None:
         """Reserves capacity for the sizes ``needed`` in another run or process in all later captures."""
         self.most_particles = max(self.most_particles, needed["rows"])
         self.most_moving = max(self.most_moving, needed.get("moving", 0))
+        margin = needed.get("margin", 1.5)  # that older versions had added
         for scenes, times, sizes in needed["geometry"]:
-            self.grow((tuple(scenes), tuple(times)), [tuple(sizes)])
+            self.grow((tuple(scenes), tuple(times)), [tuple(math.ceil(size / margin) for size in sizes)])
 
     def grow(self, clouds: tuple, sizes: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
         """Raises ``most`` of these clouds to at least all of ``sizes``, and returns it."""
         known = [self.most[clouds]] if clouds in self.most else []
-        self.most[clouds] = tuple(map(max, zip(*sizes, *known, strict=True)))
-        return self.most[clouds]
+        if sizes or known:
+            self.most[clouds] = tuple(map(max, zip(*sizes, *known, strict=True)))
+        return self.most.get(clouds, ())
 
     def graph(self, step: _Step, function: Callable[[], Any]) -> Captured:
         """Captures the graph of ``step``.
@@ -232,20 +234,22 @@ class _Step:
             if fit(self._capacities, numbers):
                 break
             self._graph = self._records = loss = errors = gradients = found = None  # frees memory before the capture
-            grown = [c.grown(number, FACTOR) for c, number in zip(self._capacities, numbers, strict=True)]
-            observed = zip(grown, self._observed(), strict=True)  # counts after an overflow are invalid
-            self._grow([c.grown((0, *seen.sizes), 1) for c, seen in observed])
+            too_small = [not c.fits(sizes) for c, sizes in zip(self._capacities, numbers, strict=True)].index(True)
+            valid = [tuple(sizes[1:]) for sizes in numbers[: too_small + 1]]  # those behind it are not
+            self._grow(self._observed(), valid)
             self._capture()
             loss, errors, gradients, found, records = self._replay()
+        self._owner.grow(self._clouds, [tuple(sizes[1:]) for sizes in numbers])
         records.replayed(report)
         return Gradients(loss, errors, gradients)
 
-    def _grow(self, needed: Sequence[PyramidCapacity]) -> None:
-        """Grows the capacities of all kinds of batches, because one that was exceeded will soon be again."""
-        if not needed:
+    def _grow(self, observed: Sequence[PyramidCapacity], found: Sequence[tuple[int, ...]] = ()) -> None:
+        """Makes capacity for the largest sizes of all kinds of batches: what was exceeded once will soon be again."""
+        if not observed:
             return
-        most = self._owner.grow(self._clouds, [capacity.sizes for capacity in needed])
-        self._capacities = [capacity.grown((0, *most), 1) for capacity in needed]
+        most = self._owner.grow(self._clouds, [*(capacity.sizes for capacity in observed), *found])
+        empty = PyramidCapacity(observed[0].n_stages, (0,) * len(most))
+        self._capacities = [empty.grown((0, *most), FACTOR)] * len(observed)
 
     # ---- computation ----
 
@@ -356,10 +360,16 @@ class _Step:
 
     @torch.no_grad()
     def _observed(self) -> list[PyramidCapacity]:
-        """Observes the geometry sizes of each step; returns capacities with a margin."""
-        geometry, needed = observing_geometry(self._owner.simulator.dynamics, FACTOR)
+        """Observes the geometry sizes of each step."""
+        dynamics, needed = self._owner.simulator.dynamics, []
+
+        def geometry(history: Particles) -> Pyramid:
+            pyramid = dynamics.geometry(history)
+            needed.append(PyramidCapacity.of(pyramid, pyramid.stages[0].n_rows, 1))
+            return pyramid
+
         if self._n_future:
-            with self._owner.simulator.dynamics.moving_at_most(self.moving):
+            with dynamics.moving_at_most(self.moving):
                 list(self._segments(self._encode(StabilityReport()), geometry, StabilityReport()))
         return needed
 

@@ -324,7 +324,7 @@ def test_the_next_run_has_the_capacity_that_graphs_needed(store, tmp_path):
     first, second = (RunTrainer(CONFIG, store, tmp_path / name, "cpu") for name in ("first", "second"))
     for trainer in (first, second):
         trainer.captured = trainer._capture()
-    known = {"rows": 10_000, "moving": 500, "geometry": [[[0], [0, 1], [7, 8]]]}
+    known = {"rows": 10_000, "moving": 500, "geometry": [[[0], [0, 1], [7, 8]]], "margin": 1}
     first.captured.reserve(known)
     end = time.monotonic() + 2
     train(first, NoWorkers(), Progress(), {}, end=end, out=tmp_path / "state", name=NAME, say=lambda _: None)

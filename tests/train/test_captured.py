@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import json
+import math
 from contextlib import nullcontext
 from functools import partial
 
@@ -355,7 +356,9 @@ def test_capacity_is_shared_between_kinds_of_steps(scenes, trainer, device):
     run(captured, longer.to(device), trainer)
     step = list(captured._steps.values())[-1]
     assert captured.captures == 2 and len(step._capacities) == longer.n_future
-    assert all(capacity.sizes[-1] == captured.most[clouds][-1] >= most[-1] + 100 for capacity in step._capacities)
+    largest = captured.most[clouds][-1]
+    assert largest >= most[-1] + 100
+    assert all(capacity.sizes[-1] == math.ceil(captured_module.FACTOR * largest) for capacity in step._capacities)
 
 
 def test_reserved_capacity_is_there_from_the_first_step(scenes, trainer, device):
@@ -363,14 +366,15 @@ def test_reserved_capacity_is_there_from_the_first_step(scenes, trainer, device)
     small, large = (batch.to(device) for batch in batches(scenes, 2))
     run(other, large, trainer)
     ((clouds, most),) = other.most.items()
-    other.most[clouds] = (most[0], *(2 * size for size in most[1:]))
+    other.most[clouds] = tuple(2 * size for size in most)
     other.most_particles = 2 * max(other.prepare(large).counts)
     captured.reserve(json.loads(json.dumps(other.needed)))
     assert captured.needed == other.needed
     loss = run(captured, small, trainer).loss.clone()
     (step,) = captured._steps.values()
     assert captured.captures == 1 and step.particles >= other.most_particles
-    assert all(capacity.sizes[1:] == other.most[clouds][1:] for capacity in step._capacities)
+    wanted = tuple(math.ceil(captured_module.FACTOR * size) for size in other.most[clouds])
+    assert all(capacity.sizes == wanted for capacity in step._capacities)
     torch.testing.assert_close(loss, run(captured_loss(trainer), small, trainer).loss, rtol=1e-4, atol=0)
 
 
