@@ -143,10 +143,10 @@ def with_weights(
 
 
 class _WithoutFirstWeights(TorchFunctionMode):
-    """Mode that skips initialisation of meta tensors, for which torch would import its compiler."""
+    """Mode that skips values of meta tensors, for which torch would import its compiler."""
 
     def __torch_function__(self, function, types, args=(), kwargs=None):
-        if function.__name__.endswith(("normal_", "uniform_")):
+        if function.__name__.endswith(("normal_", "uniform_", "div", "mul", "normalize")):
             return args[0] if args else kwargs["tensor"]
         return function(*args, **(kwargs or {}))
 
