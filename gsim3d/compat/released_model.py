@@ -83,6 +83,8 @@ class ReleasedTransformer(MultiViewTransformer):
     """With three or more views, the mask of shifted windows is tiled by view although keys are ordered by position, so
     it masks the wrong keys."""
 
+    masks_by_label = False
+
     def cross_mask(self, mask: Tensor, n_views: int) -> Tensor:
         view = torch.arange(n_views, device=mask.device)
         position = torch.arange(mask.shape[1], device=mask.device)

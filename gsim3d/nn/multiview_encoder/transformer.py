@@ -1,14 +1,18 @@
 """Attention inside each view and between the views of a cloud, in shifted windows."""
 
 import math
+from functools import partial
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from gsim3d import ops
 from gsim3d.nn.layers import Linear, RowLayerNorm, widened
 from gsim3d.nn.multiview_encoder.config import EncoderConfig
+from gsim3d.ops.curve import PatchTable
 
+MAX_HEAD_DIM = 256  # of :func:`gsim3d.ops.patch_attention`
 MASKED = -100.0  # added to the score of a masked pair; finite, so that a softmax over masked keys alone is finite
 
 
@@ -50,16 +54,34 @@ class Windows:
         x = x.reshape(-1, n_views, self.height, self.width, x.shape[-1])
         return x.roll(self.shift, (2, 3)) if shifted else x
 
-    def shift_mask(self, like: Tensor) -> Tensor:
-        """[K * K, L, L] with L = rows * cols: MASKED between pixels that are neighbours only by wrapping around."""
+    def labels(self, device: torch.device) -> Tensor:
+        """[K * K, L] with L = rows * cols, from 0 to 8: equal of true neighbours in shifted windows."""
 
         def bands(n: int, size: int, shift: int) -> Tensor:
-            i = torch.arange(n, device=like.device)
+            i = torch.arange(n, device=device)
             return (i >= n - size).long() + (i >= n - shift).long()
 
         row_band = bands(self.height, self.rows, self.shift[0])
         col_band = bands(self.width, self.cols, self.shift[1])
-        labels = self.cut((3 * row_band[:, None] + col_band)[None, None, ..., None], False)[0, ..., 0]
+        return self.cut((3 * row_band[:, None] + col_band)[None, None, ..., None], False)[0, ..., 0]
+
+    def patches(self, shape: tuple[int, ...], shifted: bool, others: bool) -> PatchTable:
+        """Of the rows of maps of ``shape``, n and V: the pixels of a window that are true neighbours attend to each
+        other, or to such ``others`` of the other views. On the CPU."""
+        shape = (*shape, self.height, self.width, 1)
+        own = self.cut(torch.arange(math.prod(shape)).view(shape), shifted)
+        keys = own if not others else own[:, :, :0] if shape[1] == 1 else other_views(own, shape[1])
+        labels = self.labels(own.device) if shifted else torch.zeros(own.shape[1:3], dtype=torch.int64)
+        n, times = len(own), keys.shape[2] // own.shape[2]
+        order, key_order = (x.argsort(dim=1, stable=True)[None, :, :, None] for x in (labels, labels.repeat(1, times)))
+        rows = (x.gather(2, by.expand(n, -1, -1, -1)).flatten() for x, by in ((own, order), (keys, key_order)))
+        counts = (labels[:, :, None] == torch.arange(9)).sum(1)
+        cu_q = F.pad(counts.repeat(n, 1).flatten().cumsum(0), (1, 0))
+        return PatchTable(*rows, cu_q, cu_q * times)
+
+    def shift_mask(self, like: Tensor) -> Tensor:
+        """[K * K, L, L]: MASKED between pixels that are neighbours only by wrapping around."""
+        labels = self.labels(like.device)
         return (labels[:, :, None] != labels[:, None, :]).to(like.dtype) * MASKED
 
 
@@ -109,6 +131,8 @@ class Layer(nn.Module):
 class MultiViewTransformer(nn.Module):
     """Self-attention and attention between views: features [n, V, C, h, w] of n clouds -> the same shape."""
 
+    masks_by_label = True  # :meth:`cross_mask` follows from :meth:`Windows.labels`
+
     def __init__(self, config: EncoderConfig):
         super().__init__()
         dim, self.split = config.feature_dim, config.window_split
@@ -123,11 +147,29 @@ class MultiViewTransformer(nn.Module):
         others, in the order of :func:`other_views`."""
         return mask.repeat(1, 1, n_views - 1)[None]
 
+    def _over_patches(self, x: Tensor, windows: Windows) -> Tensor:
+        """The layers on the CPU: windows are read in place, and wrapped ones need no mask."""
+        kinds = [(shifted, others) for shifted in (False, True) for others in (False, True)]
+        tables = {kind: windows.patches(x.shape[:2], *kind) for kind in kinds}
+
+        def attend(table: PatchTable, *qkv: Tensor) -> Tensor:
+            rows = (t.reshape(-1, 1, x.shape[-1]) for t in qkv)
+            return ops.patch_attention(*rows, table, check=False).view(x.shape)
+
+        for i, layer in enumerate(self.layers):
+            within, between = (
+                partial(attend, tables[i % 2 == 1 and self.split > 1, others]) for others in (False, True)
+            )
+            x = layer.cross_attn_ffn(layer.self_attn(x, x, within), x, between)
+        return x
+
     def forward(self, x: Tensor) -> Tensor:
         n, n_views, dim, height, width = x.shape
         windows = Windows(height, width, self.split)
         code = sine_position_code(windows.rows, windows.cols, dim, x).reshape(windows.rows, windows.cols, dim)
         x = widened(x.permute(0, 1, 3, 4, 2) + code.repeat(self.split, self.split, 1))
+        if self.masks_by_label and x.is_cpu and dim <= MAX_HEAD_DIM and not torch.compiler.is_compiling():
+            return self._over_patches(x, windows).permute(0, 1, 4, 2, 3)
         for i, layer in enumerate(self.layers):
             shifted = i % 2 == 1 and self.split > 1
             mask = windows.shift_mask(x) if shifted else None

@@ -17,9 +17,10 @@ from gsim3d.nn.multiview_encoder import Encoder, EncoderConfig, pixel_rows
 from gsim3d.nn.multiview_encoder.crops import Crops
 from gsim3d.nn.multiview_encoder.depth import CostVolume, DepthPredictor, Views, upsampling_matrix
 from gsim3d.nn.multiview_encoder.heads import ParticleHeads, PixelRays
+from gsim3d.nn.multiview_encoder.transformer import MultiViewTransformer
 from gsim3d.state import ASLEEP, DYNAMIC, FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
-from tests.nn.multiview_encoder.scenes import ROW_FIELDS, SIZE, image_rows, make_encoder, make_frames, select
+from tests.nn.multiview_encoder.scenes import CONFIG, ROW_FIELDS, SIZE, image_rows, make_encoder, make_frames, select
 
 PUBLISHED_COUNTS = [11_226_070, 11_132_118, 11_197_285]
 
@@ -173,6 +174,19 @@ def test_particles_of_small_masks_have_the_bits_of_whole_images():
         assert_same_bits(getattr(particles, name), getattr(everything, name)[masks.flatten()])
     crops = Crops.around(masks)
     assert crops.size == (24, 24) and torch.equal(crops.cut(masks).sum((1, 2)), masks.sum((1, 2)))
+
+
+@pytest.mark.parametrize("n_views", [1, 2, 3])
+def test_patches_on_the_cpu_are_windows_with_masks(n_views, monkeypatch):
+    torch.manual_seed(0)
+    transformer, results = MultiViewTransformer(CONFIG).double(), []
+    x = torch.randn(2, n_views, CONFIG.feature_dim, 8, 12, dtype=torch.float64, requires_grad=True)
+    for by_label in (False, True):
+        monkeypatch.setattr(MultiViewTransformer, "masks_by_label", by_label)
+        y = transformer(x)
+        results.append((y, torch.autograd.grad(y.square().sum(), x)[0]))
+    for masked, patched in zip(*results, strict=True):
+        assert_close_relative_to_max(patched, masked, 1e-9)
 
 
 def test_gradients_are_finite_and_reach_every_parameter():
@@ -453,9 +467,11 @@ class Calls(TorchDispatchMode):
         return function(*arguments, **(options or {}))
 
 
+@pytest.mark.parametrize("by_label", [False, True])
 @pytest.mark.parametrize("explicit", [False, True])
-def test_static_shapes_do_not_wait_for_the_device(explicit):
+def test_static_shapes_do_not_wait_for_the_device(explicit, by_label, monkeypatch):
     """Nor is anything sent there: operators that read numbers or make tensors of them are not called."""
+    monkeypatch.setattr(MultiViewTransformer, "masks_by_label", by_label)  # False: as on a GPU
     encoder, frames = make_encoder(explicit=explicit), make_frames([0, 0, 1, 1])
     frames = dataclasses.replace(frames, masks=frames.images[:, 0] < 0.4, dynamic=frames.images[:, 1] < 0.5)
     shapes = encoder.static_shapes(frames, 250)
