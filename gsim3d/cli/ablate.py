@@ -1,11 +1,5 @@
-"""``gsim3d ablate``: trains and scores ablations."""
+"""Trains and scores the paper's ablations at a given budget; writes a table.
 
-import argparse
-import math
-
-from gsim3d.cli.arguments import number, whole
-
-EPILOG = """\
 Every row is the base run with one change, trained on the same scenes for the same number of steps, and scored on the
 scenes that `gsim3d train` holds out over the same steps. Rows and base runs are declared in
 gsim3d/evaluate/ablations.yaml, or in the file of --table; --list prints the rows.
@@ -21,10 +15,13 @@ examples:
   gsim3d ablate runs/data --config train.yaml --rows latent,grid-half,grid-double --out runs/grids
 """
 
+import argparse
+import math
+
+from gsim3d.cli.arguments import number, whole
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Trains and scores the paper's ablations at a given budget; writes a table."
-    parser.epilog = EPILOG
     add = parser.add_argument
     add("data", metavar="DATA", nargs="?", help="folder with scenes of any layout (docs/reference/data.md)")
     add("--rows", default="latent,explicit,no-tem", metavar="ROW,...", help="rows to train (default: %(default)s)")

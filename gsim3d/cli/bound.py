@@ -1,10 +1,5 @@
-"""``gsim3d bound``: the score of a perfect simulator."""
+"""Scores a perfect simulator whose initial state has the uncertainty of the input images.
 
-import argparse
-
-from gsim3d.cli.arguments import whole
-
-EPILOG = """\
 Simulates and renders the scenes of a generated set again, with errors in the initial state of bodies that input images
 do not determine:
 
@@ -23,10 +18,12 @@ examples:
 With --out, an interrupted command continues when it is run again.
 """
 
+import argparse
+
+from gsim3d.cli.arguments import whole
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Scores a perfect simulator whose initial state has the uncertainty of the input images."
-    parser.epilog = EPILOG
     add = parser.add_argument
     add("set", metavar="SET", help="data set of gsim3d generate")
     help = "a model's error of the input steps: masked PSNR in dB, or metrics.json of gsim3d evaluate"

@@ -1,12 +1,5 @@
-"""``gsim3d calibrate``: cameras of own films, from a ChArUco board or structure from motion."""
+"""Computes intrinsics, poses and time offsets of films, and writes cameras.json.
 
-import argparse
-from typing import Any
-
-from gsim3d.cli.arguments import number
-from gsim3d.errors import InputError
-
-EPILOG = """\
 DIR holds one film a camera, <camera>.mp4, or one folder of such films for each take. The cameras must not move.
 
 With --board, films of a ChArUco board lie in DIR/board (or the films show it themselves): move the board slowly,
@@ -22,10 +15,14 @@ examples:
   gsim3d calibrate films --scale left right 1.2
 """
 
+import argparse
+from typing import Any
+
+from gsim3d.cli.arguments import number
+from gsim3d.errors import InputError
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Computes intrinsics, poses and time offsets of films, and writes cameras.json."
-    parser.epilog = EPILOG
     parser.add_argument("folder", metavar="DIR", help="folder with the films of a take, or with a folder for each take")
     add_calibration(parser)
     parser.add_argument("--force", action="store_true", help="also write a calibration that does not fit")

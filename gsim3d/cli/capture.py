@@ -1,11 +1,5 @@
-"""``gsim3d capture``: from own films to a simulator."""
+"""Turns films of still cameras into a simulator, step by step.
 
-import argparse
-
-from gsim3d.cli.arguments import number
-from gsim3d.cli.calibrate import add_calibration, calibration_of
-
-EPILOG = """\
 Steps, each of which prints what it decides and why, writes its result, and is skipped when it is done:
 
   calibrate   cameras.json beside the films (gsim3d calibrate), unless there are cameras
@@ -23,10 +17,13 @@ examples:
   gsim3d capture scene_with_cameras --out runs/capture --minutes 5
 """
 
+import argparse
+
+from gsim3d.cli.arguments import number
+from gsim3d.cli.calibrate import add_calibration, calibration_of
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Turns films of still cameras into a simulator, step by step."
-    parser.epilog = EPILOG
     add = parser.add_argument
     add("folder", metavar="DIR", help="folder with the films of a take, or with a folder for each take; or scenes")
     add("--out", metavar="OUT", required=True, help="run folder, created or continued")

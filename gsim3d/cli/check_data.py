@@ -1,8 +1,5 @@
-"""``gsim3d check-data``: validates recorded scenes, and draws a contact sheet of frames and cameras."""
+"""Reads recorded scenes, lists all problems, and optionally draws a contact sheet of frames and cameras.
 
-import argparse
-
-EPILOG = """\
 Reads every file of every scene: descriptions, cameras, all images and masks. Each problem is printed in one line with
 file, camera and frame. Exit code: 0 no problems, 1 problems found, 2 the check could not run.
 
@@ -26,12 +23,10 @@ examples:
   gsim3d check-data my_recording --out my_recording.png
 """
 
+import argparse
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = (
-        "Reads recorded scenes, lists all problems, and optionally draws a contact sheet of frames and cameras."
-    )
-    parser.epilog = EPILOG
     parser.add_argument("data", metavar="DIR", help="folder with scenes of any layout, or one scene folder")
     parser.add_argument("--out", metavar="FILE.png", help="contact sheet to write (default: none)")
     parser.add_argument("--quiet", action="store_true", help="print only problems and the summary")

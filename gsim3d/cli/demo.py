@@ -1,8 +1,5 @@
-"""``gsim3d demo``: generates multi-view video and predicts it with a shipped or a new simulator."""
+"""Generates multi-view video of falling bodies and predicts it with a simulator.
 
-import argparse
-
-EPILOG = """\
 Output in DIR:
   held_out/      generated multi-view video of soft bodies falling on a round ground, not seen in training
   rollout.mp4    these scenes, truth above prediction
@@ -22,10 +19,10 @@ examples:
   gsim3d demo --train --out runs/demo
 """
 
+import argparse
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Generates multi-view video of falling bodies and predicts it with a simulator."
-    parser.epilog = EPILOG
     parser.add_argument("--out", metavar="DIR", required=True, help="output folder, created if absent")
     parser.add_argument("--train", action="store_true", help="train a new simulator from scratch")
 

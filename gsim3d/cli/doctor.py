@@ -1,10 +1,5 @@
-"""``gsim3d doctor``: checks the installation and runs a self-test of every op."""
+"""``gsim3d doctor``: checks the installation and runs a self-test of every op.
 
-import argparse
-
-from gsim3d.cli.arguments import whole
-
-EPILOG = """\
 Without options: lists installed packages and compiled modules, and compares every op with plain torch.
 
 With --stability: tests invariances of the model (to translation, rotation, reordering, repetition and splitting of
@@ -23,10 +18,12 @@ examples:
 Exit code 0: all required packages work and all checks hold. 1: a failure, known or not. 2: the check could not run.
 """
 
+import argparse
+
+from gsim3d.cli.arguments import whole
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = __doc__
-    parser.epilog = EPILOG
     group = parser.add_argument_group("stability of a model or of scenes")
     group.add_argument(
         "--stability",

@@ -1,13 +1,5 @@
-"""``gsim3d effects infer``: finds the cheapest effects specification without loss of quality on a scene."""
+"""Finds the effects that a scene requires, and writes them to effects.yaml.
 
-import argparse
-from functools import partial
-
-from gsim3d.cli.arguments import add_fitting, decibels
-from gsim3d.io.terminal import progress
-from gsim3d.pretrained import CHECKPOINT_HELP
-
-EPILOG = """\
 Each effect of the checkpoint's specification is disabled or reduced on its own. Predictions of four steps at the start,
 middle and end of the video then give its worth, the loss of PSNR in dB, and its cost, the time of a step with images.
 The smallest settings within the tolerance are combined; while the combination loses more, the setting of the effect
@@ -22,10 +14,15 @@ examples:
   gsim3d simulate runs/model runs/data/ball/0000 --out runs/ball --effects runs/data/ball/0000/effects.yaml
 """
 
+import argparse
+from functools import partial
+
+from gsim3d.cli.arguments import add_fitting, decibels
+from gsim3d.io.terminal import progress
+from gsim3d.pretrained import CHECKPOINT_HELP
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Finds the effects that a scene requires, and writes them to effects.yaml."
-    parser.epilog = EPILOG
     add = parser.add_argument
     add("action", choices=("infer",), help="infer: disable effects one by one and compare")
     add("scene", metavar="SCENE", help="scene folder of any layout (docs/reference/data.md)")

@@ -1,11 +1,5 @@
-"""``gsim3d evaluate``: scores predictions on a data set."""
+"""Scores the predictions of a simulator on the scenes of a data set.
 
-import argparse
-
-from gsim3d.cli.arguments import add_fitting, whole
-from gsim3d.pretrained import CHECKPOINT_HELP
-
-EPILOG = """\
 The first steps of every scene are the input; the others are predicted and compared with the video from cameras that
 were not an input. Metrics: psnr (all pixels), psnr_masked (foreground), psnr_body (movable bodies), psnr_ground (the
 rest of the foreground), psnr_ring (ground near bodies, where shadows fall), ssim, lpips_alex, lpips_vgg and fvd.
@@ -48,10 +42,13 @@ examples:
   torchrun --nproc-per-node 4 -m gsim3d evaluate runs/model runs/data --device cuda
 """
 
+import argparse
+
+from gsim3d.cli.arguments import add_fitting, whole
+from gsim3d.pretrained import CHECKPOINT_HELP
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Scores the predictions of a simulator on the scenes of a data set."
-    parser.epilog = EPILOG
     add, checkpoint = parser.add_argument, f"{CHECKPOINT_HELP} (without it, --predictions and --baselines alone)"
     cameras = {"type": whole(0), "nargs": "+", "metavar": "CAM"}
     add("checkpoint", metavar="CHECKPOINT", nargs="?", help=checkpoint)

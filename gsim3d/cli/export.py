@@ -1,10 +1,5 @@
-"""``gsim3d export``: Gaussians as a file that other tools open, or as a video."""
+"""Write 3D Gaussians in a format that other tools open, or as a video.
 
-import argparse
-
-from gsim3d.cli.arguments import number, whole
-
-EPILOG = """\
 FILE's suffix chooses the format (docs/reference/splat_formats.md has their bounds):
   .ply             3DGS layout, read by everything               .spz              Niantic, Babylon, Cesium
   .compressed.ply  PlayCanvas, SuperSplat                        .glb              glTF with KHR_gaussian_splatting
@@ -20,10 +15,12 @@ examples:
   gsim3d export garden.ply --to garden.splat
 """
 
+import argparse
+
+from gsim3d.cli.arguments import number, whole
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Write 3D Gaussians in a format that other tools open, or as a video."
-    parser.epilog = EPILOG
     add = parser.add_argument
     help = "a file of Gaussians, a folder with one a frame, or what gsim3d simulate wrote"
     add("target", metavar="TARGET", help=help)

@@ -1,10 +1,5 @@
-"""`gsim3d generate`: generates a data set of multi-view videos."""
+"""Simulates bodies and records them with calibrated cameras on two rings.
 
-import argparse
-
-from gsim3d.cli.arguments import number, whole
-
-EPILOG = """\
 worlds:
   elastic   soft bodies fall on a round ground
   rigid     rigid bodies are thrown on a round ground
@@ -49,12 +44,14 @@ again. A larger --trajectories adds scenes to a finished set. For many machines,
 without it: tools/slurm/generate.sbatch.
 """
 
+import argparse
+
+from gsim3d.cli.arguments import number, whole
+
 LENGTH = number(0, above=True)  # metres
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Simulates bodies and records them with calibrated cameras on two rings."
-    parser.epilog = EPILOG
     add, lengths = parser.add_argument, {"type": LENGTH, "nargs": 2, "metavar": ("LOW", "HIGH")}
     add("world", metavar="WORLD", help="elastic, rigid, cloth, push, cloth-grip or hands")
     add("--out", metavar="DIR", required=True, help="folder of the data set; created or continued")

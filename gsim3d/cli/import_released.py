@@ -1,8 +1,5 @@
-"""``gsim3d import``: converts a checkpoint of the authors' release."""
+"""Imports a checkpoint of the authors' release and reports its content.
 
-import argparse
-
-EPILOG = """\
 CHECKPOINT is a .ckpt file of the release, CONFIG its resolved configuration (configs/NAME.yaml for models/NAME.ckpt).
 Sizes are taken from the weights; grid size, strides, limits and history from CONFIG. DIR becomes a checkpoint folder
 for simulate and evaluate, whose model reproduces the published one, including its bugs ("release: true" in
@@ -15,10 +12,10 @@ examples:
   gsim3d simulate runs/elastic DATA/bunny/0 --out runs/bunny
 """
 
+import argparse
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Imports a checkpoint of the authors' release and reports its content."
-    parser.epilog = EPILOG
     parser.add_argument("checkpoint", metavar="CHECKPOINT", help="published checkpoint (.ckpt)")
     parser.add_argument("--config", metavar="CONFIG", required=True, help="its resolved configuration (.yaml)")
     parser.add_argument("-o", "--out", metavar="DIR", required=True, help="folder to write; must not exist")

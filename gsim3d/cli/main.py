@@ -11,7 +11,8 @@ from gsim3d.cli.arguments import Parser
 from gsim3d.errors import CaptureError, FitWarning, InputError, NumericalError, RunStopped, did_you_mean
 from gsim3d.io.terminal import Terminal
 
-# command -> (module with add_arguments(parser) and run(args), what it does); modules load when they are called
+# command -> (module with add_arguments(parser) and run(args), what it does); modules load when they are called, and
+# their docstrings are the descriptions and epilogs of --help
 COMMANDS = {
     "generate": ("gsim3d.cli.generate", "make a data set: multi-view video of simulated bodies that fall"),
     "bound": ("gsim3d.cli.bound", "the scores that a perfect simulator has on a generated data set"),
@@ -56,7 +57,8 @@ def _command(arguments: list[str]) -> int:
             warnings.simplefilter("default", FitWarning)
             warnings.showwarning = partial(_show_warning, warnings.showwarning)
             module = importlib.import_module(COMMANDS[name][0])
-            parser = Parser(prog=f"gsim3d {name}")
+            about, _, epilog = (module.__doc__ or "").partition("\n\n")
+            parser = Parser(prog=f"gsim3d {name}", description=about, epilog=epilog)
             module.add_arguments(parser)
             args = parser.parsed(arguments[1:])
             return module.run(args) or 0

@@ -1,11 +1,5 @@
-"""``gsim3d plan``: shows the computations that a model performs for a scene."""
+"""Shows which effects are computed, and their predicted costs.
 
-import argparse
-
-from gsim3d.cli.arguments import add_fitting
-from gsim3d.pretrained import CHECKPOINT_HELP, folder_of
-
-EPILOG = """\
 Without --effects, the specification is effects.yaml of the scene or its data set, or else that of the checkpoint, as
 for gsim3d simulate. Without a checkpoint, the model is the preset tiny. Multiply-adds of matrix products, attention and
 splats are predicted from layer sizes and the scene's masks; they compare two plans of one model
@@ -17,10 +11,13 @@ examples:
   gsim3d plan runs/data/ball/0000 elastic-small --effects effects.yaml
 """
 
+import argparse
+
+from gsim3d.cli.arguments import add_fitting
+from gsim3d.pretrained import CHECKPOINT_HELP, folder_of
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Shows which effects are computed, and their predicted costs."
-    parser.epilog = EPILOG
     parser.add_argument("scene", metavar="SCENE", help="scene folder of any layout (docs/reference/data.md)")
     parser.add_argument("checkpoint", metavar="CHECKPOINT", nargs="?", help=CHECKPOINT_HELP)
     add_fitting(parser)

@@ -1,12 +1,5 @@
-"""``gsim3d profile``: accuracy against time."""
+"""Measures accuracy against time of a trained simulator on this machine.
 
-import argparse
-
-from gsim3d.cli.arguments import number
-from gsim3d.io.terminal import progress
-from gsim3d.pretrained import CHECKPOINT_HELP
-
-EPILOG = """\
 Changes one setting of the simulator at a time: precision, graph capture, input views and steps, retained particles,
 sleep, patch and grid size, ... For each setting, it measures the error against the reference run (same checkpoint in
 float32) and against the video, and the time of a step by section. Written to DIR: report.html (one page, needs no
@@ -22,10 +15,14 @@ examples:
   gsim3d profile elastic-small data/elastic-unseen --scenes all --settings history "grid size" --out runs/profile
 """
 
+import argparse
+
+from gsim3d.cli.arguments import number
+from gsim3d.io.terminal import progress
+from gsim3d.pretrained import CHECKPOINT_HELP
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Measures accuracy against time of a trained simulator on this machine."
-    parser.epilog = EPILOG
     add = parser.add_argument
     add("checkpoint", metavar="CHECKPOINT", help=CHECKPOINT_HELP)
     data = "folder with scenes, or one scene folder (default: two scenes, generated in DIR/scenes)"

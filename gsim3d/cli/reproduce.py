@@ -1,11 +1,5 @@
-"""``gsim3d reproduce``: measures the tables and figures of the paper."""
+"""Measures every table and figure of the paper that the data at hand allow; one page.
 
-import argparse
-
-from gsim3d.cli.arguments import number, whole
-from gsim3d.pretrained import CHECKPOINT_HELP
-
-EPILOG = """\
 Tables, each with cost, seed, device, paired standard errors against the first row, the change since the last run in
 DIR, and the paper's value, which is of other data:
 
@@ -35,10 +29,13 @@ examples:
   gsim3d reproduce --out runs/paper --train 2000 --preset small --budget 120 --device cuda
 """
 
+import argparse
+
+from gsim3d.cli.arguments import number, whole
+from gsim3d.pretrained import CHECKPOINT_HELP
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Measures every table and figure of the paper that the data at hand allow; one page."
-    parser.epilog = EPILOG
     add = parser.add_argument
     model = f"{CHECKPOINT_HELP}; without WORLD it is scored in all worlds (default: the shipped simulators)"
     add("models", metavar="[WORLD=]CHECKPOINT", nargs="*", help=model)

@@ -1,12 +1,5 @@
-"""``gsim3d simulate``: predict the future of one scene."""
+"""Predicts the future of one scene and writes it as video and as 3D Gaussians.
 
-import argparse
-
-from gsim3d.cli.arguments import add_fitting, number, whole
-from gsim3d.io.terminal import progress
-from gsim3d.pretrained import CHECKPOINT_HELP
-
-EPILOG = """\
 The scene's first steps are the input; the following ones are predicted, also beyond the end of the video. Written to
 DIR: rollout.mp4 (truth above prediction, a column for each camera; H.264 with gsim3d[video], else VP9), frames/
 (predicted images as PNG), gaussians/step_0000.ply ... (3D Gaussians of every step, for viewers of 3D Gaussian
@@ -23,13 +16,16 @@ edits.yaml, a list (docs/reference/effects.md has all operations):
   - {step: 8, op: throw, of: moving, velocity: [0, 0, 0.1]}   metres a step
 """
 
+import argparse
+
+from gsim3d.cli.arguments import add_fitting, number, whole
+from gsim3d.io.terminal import progress
+from gsim3d.pretrained import CHECKPOINT_HELP
 
 BOUND_HELP = "print from which step on the bound of the error exceeds this, and show the bound in rollout.mp4"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Predicts the future of one scene and writes it as video and as 3D Gaussians."
-    parser.epilog = EPILOG
     add, cameras = parser.add_argument, {"type": whole(0), "nargs": "+", "metavar": "CAM"}
     add("checkpoint", metavar="CHECKPOINT", help=CHECKPOINT_HELP)
     add("scene", metavar="SCENE", help="scene folder of any layout (docs/reference/data.md)")

@@ -1,10 +1,5 @@
-"""``gsim3d train``: trains a simulator on a data set."""
+"""Trains a simulator on multi-view video; writes checkpoints and a log into a run folder.
 
-import argparse
-
-from gsim3d.cli.arguments import whole
-
-EPILOG = """\
 CONFIG is a YAML file. Missing keys have defaults; unknown keys are an error. For example:
 
   preset: tiny
@@ -24,10 +19,12 @@ examples:
   torchrun --nproc-per-node 4 -m gsim3d train train.yaml --data runs/data --out runs/model --device cuda
 """
 
+import argparse
+
+from gsim3d.cli.arguments import whole
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Trains a simulator on multi-view video; writes checkpoints and a log into a run folder."
-    parser.epilog = EPILOG
     add = parser.add_argument
     add("config", metavar="CONFIG", nargs="?", help="YAML file with the run's settings")
     add("--data", metavar="DIR", help="folder with scenes of any layout (docs/reference/data.md)")

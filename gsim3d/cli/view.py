@@ -1,11 +1,5 @@
-"""``gsim3d view``: look around in a prediction or a scene, in a browser."""
+"""Look around in a prediction or a scene in a browser: orbit, play, pause, scrub, edit.
 
-import argparse
-
-from gsim3d.cli.arguments import add_fitting, number, whole
-from gsim3d.pretrained import CHECKPOINT_HELP
-
-EPILOG = """\
 Serves the viewer on this machine, prints its address and runs until Ctrl-C. It needs pip install 'gsim3d[viewer]'.
 
 examples:
@@ -17,10 +11,13 @@ examples:
   gsim3d view garden.spz
 """
 
+import argparse
+
+from gsim3d.cli.arguments import add_fitting, number, whole
+from gsim3d.pretrained import CHECKPOINT_HELP
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Look around in a prediction or a scene in a browser: orbit, play, pause, scrub, edit."
-    parser.epilog = EPILOG
     add = parser.add_argument
     add("target", metavar="TARGET", help="run, its state, scene folder, file of Gaussians, or folder with one a frame")
     add("--scene", metavar="SCENE", help="recorded scene that TARGET predicts")

