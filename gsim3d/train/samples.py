@@ -40,10 +40,6 @@ class Batch:
         noise = None if self.noise is None else self.noise.to(device)
         return dataclasses.replace(self, context=self.context.to(device), targets=self.targets.to(device), noise=noise)
 
-    def target_step(self) -> Tensor:
-        """Returns int64 [I], the step in its window of each target image."""
-        return self.targets.cameras.image_cloud % (self.n_context + self.n_future)
-
 
 class BatchReader:
     """Reads the batches of a run, prefetching those of the next steps.

@@ -76,7 +76,7 @@ def test_store_batches_equal_those_of_scene_folders(world, spread, tmp_path):
         wanted = draw_batch(scenes, CONFIG.data, phase, 5, step, range(3))
         assert torch.equal(given.noise, wanted.noise)
         assert (given.n_context, given.n_future) == (wanted.n_context, wanted.n_future)
-        assert len(given.targets.images) == len(given.target_step()) == 3 * 2 * (given.n_context + given.n_future)
+        assert len(given.targets.images) == len(given.targets.cameras) == 3 * 2 * (given.n_context + given.n_future)
         for part in ("context", "targets"):
             a, b = getattr(given, part), getattr(wanted, part)
             for name in ("images", "cloud_scene", "cloud_step", "origin", "masks", "dynamic"):

@@ -331,7 +331,7 @@ def test_cut_bounds_steps_of_gradients(folder, tmp_path):
         trainer.step = 0  # one that is logged
         images = trainer._images(batch, 0, watch)
         errors = (images - batch.targets.images.permute(0, 2, 3, 1)).square()
-        errors[batch.target_step() == batch.n_context + 3].mean().backward()
+        errors[batch.targets.cameras.image_cloud == batch.n_context + 3].mean().backward()
         reached[cut] = [norm > 0 for norm in watch.norms()]
     assert reached[0] == reached[4] == [True] * 4
     assert reached[1] == [False, False, False, True]
