@@ -133,6 +133,7 @@ class ClothCover(TaskEnv):
 
     actors = ("grippers", (2, 3))
     max_action = (MAX_SPEED,) * 6
+    reached = 1 - COVERED
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> ClothScene:
@@ -156,10 +157,6 @@ class ClothCover(TaskEnv):
         region = goals[:, None] + torch.from_numpy(_disc()).to(goals)
         away = torch.cdist(region, points[..., :2]).masked_fill((points[..., 2] > FLAT)[:, None], torch.inf)
         return (away.amin(-1) > SPACING).double().mean(-1)
-
-    @classmethod
-    def solved(cls, distances: Tensor) -> Tensor:
-        return distances < 1 - COVERED
 
 
 def _disc() -> np.ndarray:

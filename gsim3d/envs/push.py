@@ -99,19 +99,13 @@ class PushToGoal(_Push):
     The reward is minus the distance of the body's centre to the goal, metres.
     """
 
+    reached = REACHED
+
     @classmethod
     def draw(cls, rng: np.random.Generator) -> PushScene:
         at = rng.uniform(-0.2, 0.2, 2)
         body = pushing.draw_body(pushing.OBJECTS[rng.integers(len(pushing.OBJECTS))], at, rng.uniform(0, 2 * np.pi))
         return PushScene([body], at + polar(rng, PUSHER_DISTANCE), at + polar(rng, GOAL_DISTANCE))
-
-    @classmethod
-    def distances(cls, scenes: Scenes, goals: Tensor) -> Tensor:
-        return (scenes.centers()[:, 0, :2] - goals).norm(dim=-1)
-
-    @classmethod
-    def solved(cls, distances: Tensor) -> Tensor:
-        return distances < REACHED
 
 
 class PushClear(_Push):

@@ -58,6 +58,7 @@ class TaskEnv(gymnasium.Env):
     max_bodies: ClassVar[int] = 1
     actors: ClassVar[tuple[str, tuple[int, ...]] | None] = None  # name and shape of their observed positions
     max_action: ClassVar[tuple[float, ...]]
+    reached: ClassVar[float]  # distance below which a scene is solved
     true_scenes: ClassVar[type[TrueScenes]] = TrueScenes
     shipped: ClassVar[str] = ""  # name of the simulator that is the default of ``model``, once it ships
 
@@ -109,14 +110,14 @@ class TaskEnv(gymnasium.Env):
         """Simulates a step with ``actions`` [n, A]. Returns the executed ones."""
 
     @classmethod
-    @abstractmethod
     def distances(cls, scenes: Scenes, goals: Tensor) -> Tensor:
-        """How far scenes are from ``goals`` [n, 2], [n]; minus the reward."""
+        """How far scenes are from ``goals`` [n, 2], [n]; minus the reward. Default: of the first body, in metres."""
+        return (scenes.centers()[:, 0, :2] - goals).norm(dim=-1)
 
     @classmethod
-    @abstractmethod
     def solved(cls, distances: Tensor) -> Tensor:
-        """Whether scenes at ``distances`` [n] are solved, bool [n]."""
+        """Whether scenes at ``distances`` [n] are solved, bool [n]. Default: where they are below ``reached``."""
+        return distances < cls.reached
 
     @classmethod
     def ended(cls, distances: Tensor) -> Tensor:

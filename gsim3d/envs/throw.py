@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.envs.model import ModelScenes
-from gsim3d.envs.scenes import FPS, N_PARTICLES, Scenes, TrueScene, TrueScenes, polar
+from gsim3d.envs.scenes import FPS, N_PARTICLES, TrueScene, TrueScenes, polar
 from gsim3d.envs.tasks import TaskEnv
 from gsim3d.synth import pushing
 from gsim3d.synth.embedding import RigidFrame
@@ -85,6 +85,7 @@ class ThrowToTarget(TaskEnv):
 
     max_action = (MAX_SPEED,) * 3
     true_scenes = ThrowScenes
+    reached = REACHED
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> ThrowScene:
@@ -104,14 +105,6 @@ class ThrowToTarget(TaskEnv):
         for _ in range(FRAMES):
             scenes.move(scenes.actors())
         return actions.clone()
-
-    @classmethod
-    def distances(cls, scenes: Scenes, goals: Tensor) -> Tensor:
-        return (scenes.centers()[:, 0, :2] - goals).norm(dim=-1)
-
-    @classmethod
-    def solved(cls, distances: Tensor) -> Tensor:
-        return distances < REACHED
 
     @classmethod
     def ended(cls, distances: Tensor) -> Tensor:
