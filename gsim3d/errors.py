@@ -3,6 +3,7 @@
 import difflib
 import platform
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +86,15 @@ class RunStopped(RuntimeError):
     def __init__(self, message: str, code: int = 2):
         super().__init__(message)
         self.code = code
+
+
+@contextmanager
+def naming(where: str, kinds: type[Exception] | tuple[type[Exception], ...] = InputError) -> Iterator[None]:
+    """Context that raises errors of ``kinds`` as an InputError whose message begins with ``where``."""
+    try:
+        yield
+    except kinds as error:
+        raise InputError(f"{where}: {error}") from None
 
 
 def did_you_mean(name: object, known: Iterable[str]) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 from gsim3d.compat.released import DYNAMICS, ENCODER, HEAD, LATENTS
 from gsim3d.compat.released_model import ReleasedDynamicsConfig, ReleasedModelConfig
 from gsim3d.effects.spec import DynamicsEffects, EffectsSpec
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, naming
 from gsim3d.io.files import shown
 from gsim3d.nn.gaussian_head import RendererConfig
 from gsim3d.nn.multiview_encoder import EncoderConfig
@@ -176,15 +176,13 @@ def read_config(content: dict, shapes: Shapes) -> ReleasedConfig:
     if history not in HISTORIES:
         raise InputError(f"dataset.n_step_state: must be {', '.join(map(str, HISTORIES))}; got {history}")
     scales = {f"scale_{end}": settings.positive(f"model.state_adapter.gaussians.scale_{end}") for end in ("min", "max")}
-    try:
+    with naming("settings and weights do not describe a valid model", ValueError):
         encoder = EncoderConfig(**_encoder(settings, sizes), dynamic_dim=n_dynamic, static_dim=n_static, **common)
         latents = {"dynamic_latents": n_dynamic, "static_latents": n_static, "history_bits": history.bit_length() - 1}
         dynamics = ReleasedDynamicsConfig(**_dynamics(settings, sizes), **updates, **latents, **scales, **common)
         read = 0 if explicit else n_dynamic + n_static
         renderer = RendererConfig(latents=read, sh_degree=sh_degree, jacobian="clamped", **scales)
         model = ReleasedModelConfig(encoder, dynamics, renderer)
-    except ValueError as error:
-        raise InputError(f"settings and weights do not describe a valid model: {error}") from None
     data, effects, notes = _data(settings, history, encoder.size_multiple)
     return ReleasedConfig(model, data, effects, (*sizes.notes, *notes), tuple(settings.unread()))
 

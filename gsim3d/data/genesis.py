@@ -15,7 +15,7 @@ from gsim3d.data.cameras import check_intrinsics, check_pose
 from gsim3d.data.images import as_color, as_labels, read_files
 from gsim3d.data.lenses import lens_of
 from gsim3d.data.recording import Camera, Description, Problems, Recording, inside
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, naming
 
 NAME = "genesis"
 FILE = "metadata.json"
@@ -84,10 +84,8 @@ def _template(metadata: Description) -> str:
     template, where = metadata.values.get("file_path_template"), f"{metadata.where}file_path_template"
     if not isinstance(template, str):
         raise InputError(f"{where} must be a string; got {template!r}")
-    try:
+    with naming(f"{where} {template!r} is not a format string", ValueError):
         parts = [part for part in string.Formatter().parse(template) if part[1] is not None]
-    except ValueError as error:
-        raise InputError(f"{where} {template!r} is not a format string: {error}") from error
     fields = {field for _, field, _, _ in parts}
     if fields != TEMPLATE_FIELDS:
         raise InputError(

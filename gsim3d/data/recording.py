@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, naming
 from gsim3d.io.files import MAX_TEXT, read_file
 
 MAX_STEPS, MAX_CAMS, MAX_SIZE = 1_000_000, 10_000, 16_384  # larger values are rejected as errors
@@ -226,11 +226,9 @@ def array(value: Any, shapes: Sequence[tuple], what: str, problems: Problems, mo
 def read_json(file: Path) -> dict:
     """Reads the JSON object in ``file``. Raises InputError if it cannot be read or is not an object."""
     content = read_file(file, MAX_TEXT)
-    try:
+    with naming(f"{file} cannot be read", (ValueError, RecursionError, MemoryError)):
         text = content.decode(json.detect_encoding(content))
         content = json.loads(text)
-    except (ValueError, RecursionError, MemoryError) as error:
-        raise InputError(f"{file} cannot be read: {error}") from error
     if not isinstance(content, dict):
         raise InputError(f"{file} must hold a JSON object; got {type(content).__name__}")
     if HALF_PAIR.search(text):  # unpaired surrogates cannot be encoded for file names and messages

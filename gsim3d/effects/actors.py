@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gsim3d.effects.selection import Selection, newest_mask
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, naming
 from gsim3d.state import DYNAMIC, Particles, last_steps, newest_clouds
 
 
@@ -67,10 +67,8 @@ class Actors:
         self._displacements = torch.stack(given).to(state.means)  # [A, B, T, 3]
         marks = torch.full_like(state.activity, -1, dtype=torch.int64)
         for number, actor in enumerate(actors):
-            try:
+            with naming(f"actors[{number}]"):
                 mask = actor.of.mask(state)
-            except InputError as error:
-                raise InputError(f"actors[{number}]: {error}") from None
             if bool((marks[mask] >= 0).any()):
                 raise InputError(f"actors[{number}]: some of its particles belong to another actor")
             if bool((state.activity[mask] != DYNAMIC).any()):

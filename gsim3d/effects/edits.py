@@ -22,7 +22,7 @@ from torch.nn import functional as F
 
 from gsim3d.effects.selection import Selection, Vector, newest_mask
 from gsim3d.effects.spec import StructureEffects
-from gsim3d.errors import InputError, check_one_of
+from gsim3d.errors import InputError, check_one_of, naming
 from gsim3d.io.files import read_yaml, shown
 from gsim3d.io.settings import from_dict
 from gsim3d.math.rotations import quat_product, rotate_left, rotation_matrices
@@ -114,7 +114,11 @@ class Rotate(Operation):
         vector = F.normalize(torch.tensor(self.axis, dtype=torch.float64), dim=0) * math.radians(self.degrees)
         quat = rotate_left(torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64), vector[None])
         matrix = rotation_matrices(quat)[0].to(means)
-        pivots = _centers(state, chosen) if self.about is None else _from_world(state, self.about)
+        if self.about is None:
+            pivots = _centers(state, chosen)
+        else:
+            pivot = means.new_tensor(self.about, dtype=torch.float64)
+            pivots = (pivot if (offset := state.row_offset()) is None else pivot - offset).to(means)
         fields = {name: (x - pivots) @ matrix.T + pivots for name, x in _attributes(state, "point").items()}
         fields |= {name: x @ matrix.T for name, x in _attributes(state, "vector").items()}
         if state.quats is not None:
@@ -231,8 +235,9 @@ class Insert(Operation):
         fields = {name: torch.cat([x[a:b] for a, b in runs]) for name, x in given.row_fields().items()}
         own = {"origin": state.origin, "world_offset": state.world_offset}
         here = dataclasses.replace(given, **own).with_clouds(counts, **fields)
-        there = None if given.world_offset is None else given.world_offset[given.clouds.scenes[-1]]
-        by = _between(there, here.row_offset(), self.by)
+        by = here.means.new_tensor(self.by, dtype=torch.float64)  # then plus the difference of the world offsets
+        by = by if given.world_offset is None else by + given.world_offset[given.clouds.scenes[-1]]
+        by = by if (offset := here.row_offset()) is None else by - offset
         return joined_clouds(state, _moved(here, torch.ones_like(here.activity, dtype=torch.bool), by))
 
 
@@ -258,10 +263,8 @@ class Edit:
 
     def apply(self, state: Particles, colors: Colors) -> Particles:
         """Applies the operation. Errors name its step."""
-        try:
+        with naming(self.where):
             return self.operation.apply(state, colors)
-        except InputError as error:
-            raise InputError(f"{self.where}: {error}") from None
 
 
 def by_step(edits: Iterable[Edit], n_steps: int, *, insert: bool, remove: bool) -> dict[int, list[Edit]]:
@@ -319,10 +322,8 @@ def _edit(values: Any, where: str, folder: Path, encode: Callable[[Path], Partic
     if kind is Insert:
         if "particles" in values or not isinstance(values.get("scene"), str):
             raise InputError(f"{where}: scene must name a scene folder; got {shown(values.get('scene'))}")
-        try:
+        with naming(where):
             given["particles"] = encode(folder / values.pop("scene"))
-        except InputError as error:
-            raise InputError(f"{where}: {error}") from None
     return Edit(step, dataclasses.replace(from_dict(kind, values, f"{where}: "), **given))
 
 
@@ -341,22 +342,6 @@ def _moved(state: Particles, chosen: Tensor, by: Vector | Tensor) -> Particles:
 def _attributes(state: Particles, kind: str) -> dict[str, Tensor]:
     """Attributes of ``state`` of this kind."""
     return {name: value for name, value in state.row_fields().items() if ATTRIBUTES[name].kind == kind}
-
-
-def _from_world(state: Particles, position: Vector) -> Tensor:
-    """World ``position`` relative to the world offset of each particle, [N, 3]."""
-    offset = state.row_offset()
-    position = torch.tensor(position, dtype=torch.float64, device=state.means.device).expand(state.n_rows, 3)
-    return (position if offset is None else position - offset).to(state.means)
-
-
-def _between(there: Tensor | None, here: Tensor | None, by: Vector) -> Vector | Tensor:
-    """Displacement from coordinates with offset ``there`` [3] to those with offsets ``here`` [N, 3], plus ``by``."""
-    if there is None and here is None:
-        return by
-    known = there if here is None else here
-    there, here = (known.new_zeros(3) if offset is None else offset for offset in (there, here))
-    return known.new_tensor(by) + there - here
 
 
 def _centers(state: Particles, chosen: Tensor) -> Tensor:

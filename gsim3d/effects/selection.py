@@ -7,7 +7,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from gsim3d.errors import InputError, check_one_of
+from gsim3d.errors import InputError, check_one_of, naming
 from gsim3d.state import DYNAMIC, FROZEN, Particles
 
 Vector = tuple[float, float, float]
@@ -46,27 +46,21 @@ class Selection:
             for coordinate, low, high in zip(positions.unbind(1), *self.box, strict=True):
                 chosen = chosen & (coordinate >= low) & (coordinate <= high)
         captured = chosen.is_cuda and torch.cuda.is_current_stream_capturing()
-        if not captured and not bool(chosen[newest_mask(particles)].any()):
-            raise InputError(self._empty(positions[of_kind & newest_mask(particles)]))
+        if not captured and not bool(chosen[newest := newest_mask(particles)].any()):
+            message, positions = f"the selection is empty: no particle is {self.which}", positions[of_kind & newest]
+            if self.box is not None and len(positions):
+                corners = [[round(x, 2) for x in corner.tolist()] for corner in (positions.amin(0), positions.amax(0))]
+                message += f" in the box {[list(corner) for corner in self.box]}; their bounds are {corners}"
+            raise InputError(message)
         return chosen
-
-    def _empty(self, positions: Tensor) -> str:
-        """Message for an empty selection; ``positions`` are those of the particles of its kind."""
-        message = f"the selection is empty: no particle is {self.which}"
-        if self.box is None or not len(positions):
-            return message
-        corners = [[round(x, 2) for x in corner.tolist()] for corner in (positions.amin(0), positions.amax(0))]
-        return f"{message} in the box {[list(corner) for corner in self.box]}; their bounds are {corners}"
 
 
 def any_mask(selections: Iterable[Selection], particles: Particles, where: str) -> Tensor:
     """Mask bool [N] of the union of ``selections``. Errors of :meth:`Selection.mask` name ``where``."""
     chosen = torch.zeros_like(particles.activity, dtype=torch.bool)
     for number, selection in enumerate(selections):
-        try:
+        with naming(f"{where}[{number}]"):
             chosen = chosen | selection.mask(particles)
-        except InputError as error:
-            raise InputError(f"{where}[{number}]: {error}") from None
     return chosen
 
 

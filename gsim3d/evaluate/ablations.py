@@ -21,7 +21,7 @@ import torch
 import gsim3d
 from gsim3d.data import Scene, split_scenes
 from gsim3d.effects.spec import EffectsSpec
-from gsim3d.errors import CaptureError, InputError, NumericalError, did_you_mean
+from gsim3d.errors import CaptureError, InputError, NumericalError, did_you_mean, naming
 from gsim3d.evaluate.compare import paired
 from gsim3d.evaluate.protocol import horizon, score_scene
 from gsim3d.evaluate.report import summarize, write_json
@@ -177,12 +177,10 @@ class Study:
         return [Scene.open(folder, fitting=self.base.data.fitting) for folder in folders]
 
     def _config(self, row: Row) -> TrainConfig:
-        try:
+        with naming(f"row {row.name}"):
             config = changed(self.base, row.change)
             check_scenes(self.test, config.data, ())
             Trainer(config, self.train, os.devnull)  # validates the remaining settings; writes nothing
-        except InputError as error:
-            raise InputError(f"row {row.name}: {error}") from None
         return config
 
     def same_as(self, name: str) -> str:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gsim3d.data import Scene
 from gsim3d.data.actions import UNREADABLE
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, naming
 from gsim3d.state import DYNAMIC, Particles
 from gsim3d.synth.embedding import ParticleCloud
 
@@ -152,11 +152,9 @@ def true_states(scene: Scene) -> list[Tensor] | None:
     file = scene.path / "states.npz"
     if not file.is_file() or scene.fitting.unit_cameras:
         return None
-    try:
+    with naming(f"{file}: cannot be read", UNREADABLE):
         with np.load(file, allow_pickle=False) as states:
             found = [torch.from_numpy(states[name]) for name in states.files if name != "actors"]
-    except UNREADABLE as error:
-        raise InputError(f"{file}: cannot be read: {error}") from None
     for nodes in found:
         if nodes.ndim < 3 or nodes.shape[-1] != 3 or not nodes.isfinite().all():
             raise InputError(f"{file}: each body must be [T, ..., 3] finite numbers; got {list(nodes.shape)}")

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, naming
 from gsim3d.io.plain import parse_yaml
 
 _BOUNDED = reprlib.Repr()
@@ -131,10 +131,8 @@ def read_yaml(path: str | Path, kind: Any = dict) -> Any:
         InputError: as :func:`read_file`, it is no YAML, or it holds something else; the message names it.
     """
     text = read_file(path, MAX_TEXT)
-    try:
+    with naming(f"{path} cannot be read: not valid YAML", ValueError):
         content = parse_yaml(text)
-    except ValueError as error:
-        raise InputError(f"{path} cannot be read: not valid YAML: {error}") from None
     if not isinstance(content, kind):
         wanted = "list" if kind is list else "mapping"
         raise InputError(f"{path} must hold a {wanted}; got {type(content).__name__}")

@@ -5,7 +5,7 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, naming
 from gsim3d.io.files import MAX_TEXT, read_file
 from gsim3d.io.formats import FORMATS, read_splats
 from gsim3d.state import Gaussians
@@ -63,10 +63,9 @@ def _suffix(path: Path) -> str | None:
 def _fps(about: Path) -> float | None:
     if not about.is_file():
         return None
-    try:
+    kinds = ValueError, KeyError, TypeError, OverflowError, RecursionError
+    with naming(f"{about}: not the description of a sequence", kinds):
         fps = json.loads(read_file(about, MAX_TEXT))["fps"]
         if isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 0 < fps < math.inf:
             raise ValueError(f"fps must be a positive number; got {fps!r:.40}")
         return float(fps)
-    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-        raise InputError(f"{about}: not the description of a sequence: {error}") from None

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, naming
 from gsim3d.io.arrays import Splats, from_smallest_three, pack_tens, read_bytes, smallest_three, unpack_tens
 from gsim3d.io.files import write_whole
 
@@ -57,7 +57,7 @@ def read(path: Path) -> Splats:
 
 def _read_gzip(path: Path, content: bytes) -> Splats:
     stream = zlib.decompressobj(wbits=31)
-    try:
+    with naming(f"{path}: damaged", zlib.error):
         head = stream.decompress(content, HEADER.size)
         if len(head) < HEADER.size:
             raise InputError(f"{path}: truncated within its header")
@@ -67,8 +67,6 @@ def _read_gzip(path: Path, content: bytes) -> Splats:
         body = stream.decompress(stream.unconsumed_tail, sum(sizes)) if sum(sizes) else b""
         while not stream.eof and stream.decompress(stream.unconsumed_tail, MOST_BEHIND):
             pass  # extensions; the checksum stands at the end
-    except zlib.error as error:
-        raise InputError(f"{path}: damaged: {error}") from None
     if len(body) < sum(sizes) or not stream.eof:
         raise InputError(f"{path}: truncated: {len(body)} bytes of {count} Gaussians; expected {sum(sizes)}")
     bounds = np.cumsum([0, *sizes])
@@ -95,11 +93,9 @@ def _read_streams(path: Path, content: bytes) -> Splats:
         packed, whole = STREAMS.unpack_from(content, table + index * STREAMS.size)
         if whole != size or begin + packed > len(content):
             raise InputError(f"{path}: stream {index} has {whole} bytes; expected {size} within the file")
-        try:
+        with naming(f"{path}: stream {index} is damaged", zstandard.ZstdError):
             with zstandard.ZstdDecompressor().stream_reader(content[begin : begin + packed]) as stream:
                 part = stream.read(size + 1)  # a small frame may unpack to much more
-        except zstandard.ZstdError as error:
-            raise InputError(f"{path}: stream {index} is damaged: {error}") from None
         if len(part) != size:
             amount = "more" if len(part) > size else "fewer"
             raise InputError(f"{path}: stream {index} holds {amount} than {size} bytes")

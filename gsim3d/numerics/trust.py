@@ -8,7 +8,7 @@ histories. The spread of a particle over them, and the number of steps, give a b
 import dataclasses
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from gsim3d.cameras import Cameras, Frames
 from gsim3d.effects.plan import Plan
-from gsim3d.errors import InputError, UnfamiliarInput
+from gsim3d.errors import InputError, UnfamiliarInput, naming
 from gsim3d.io.files import MAX_TEXT, read_file
 from gsim3d.io.plain import is_number, parse_json
 from gsim3d.io.settings import from_dict
@@ -152,10 +152,8 @@ def read_checkpoints(path: Path) -> dict[str, Any]:
     """Reads plain values by the digest of a checkpoint, {} without a file. Raises InputError if it is invalid."""
     if not path.is_file():
         return {}
-    try:
+    with naming(f"{path} cannot be read", ValueError):
         content = parse_json(read_file(path, MAX_TEXT))
-    except ValueError as error:
-        raise InputError(f"{path} cannot be read: {error}") from None
     if not isinstance(content, dict):
         raise InputError(f"{path} must hold a mapping of checkpoints")
     return content
@@ -223,7 +221,13 @@ def rollout_with_spread(
     config, count, state = simulator.config.dynamics, len(VARIANTS), histories[0]
     if not config.origin_of_scene:
         raise InputError("spread: scenes of one call change each other in the published model; use another checkpoint")
-    geometry = None if config.is_asymmetric else _shifted(simulator, len(state.origin), state.means.device)
+    cells = torch.tensor([cells for _, cells in VARIANTS], dtype=torch.float64, device=state.means.device)
+    shifts = (cells * config.grid_size).repeat(len(state.origin), 1)
+
+    def shifted(history: Particles) -> Pyramid:
+        return simulator.dynamics.geometry(dataclasses.replace(history, origin=history.origin - shifts))
+
+    geometry = None if config.is_asymmetric else shifted
     with simulator.setting.precision("dynamics", state.means.device.type):
         rolled = simulator.rollout(variants(histories), n_steps, plan, geometry=geometry, **options)
     steps, spreads = [], []
@@ -236,17 +240,6 @@ def rollout_with_spread(
         means = [step.means[a:b].unflatten(0, (count, -1)) for a, b in zip(starts, starts[1:])]
         spreads.append(torch.cat([(x - x.mean(0)).square().sum(-1).mean(0).sqrt() for x in means]))
     return steps, torch.stack(spreads)
-
-
-def _shifted(simulator: Any, n_scenes: int, device: torch.device) -> Callable[[Particles], Pyramid]:
-    """Returns a function history of variants -> geometry of a call on their shifted grids."""
-    cells = torch.tensor([cells for _, cells in VARIANTS], dtype=torch.float64, device=device)
-    shifts = (cells * simulator.config.dynamics.grid_size).repeat(n_scenes, 1)
-
-    def geometry(history: Particles) -> Pyramid:
-        return simulator.dynamics.geometry(dataclasses.replace(history, origin=history.origin - shifts))
-
-    return geometry
 
 
 @torch.no_grad()

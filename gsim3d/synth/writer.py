@@ -18,7 +18,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, naming
 from gsim3d.io.files import write_whole
 from gsim3d.io.machine import processor_name
 from gsim3d.io.plain import parse_json
@@ -67,10 +67,8 @@ def is_finished(folder: Path, fingerprint: str) -> bool:
 
 def read_metadata(folder: Path) -> dict:
     """Reads metadata.json of a scene. Raises InputError if it is invalid."""
-    try:
+    with naming(f"{folder / 'metadata.json'} cannot be read", (OSError, ValueError)):
         return parse_json((folder / "metadata.json").read_bytes())
-    except (OSError, ValueError) as error:
-        raise InputError(f"{folder / 'metadata.json'} cannot be read: {error}") from error
 
 
 def write_scene(out: Path, scene: Scene) -> Path:

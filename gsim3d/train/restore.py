@@ -16,7 +16,7 @@ from gsim3d.data import Scene
 from gsim3d.data.fitting import frame_stride
 from gsim3d.effects.plan import Plan
 from gsim3d.effects.spec import EffectsSpec
-from gsim3d.errors import FitWarning, InputError, did_you_mean
+from gsim3d.errors import FitWarning, InputError, did_you_mean, naming
 from gsim3d.io.checkpoint import Checkpoint
 from gsim3d.io.files import shown
 from gsim3d.io.settings import from_dict, to_dict, upgraded
@@ -193,8 +193,6 @@ def restore(path: str | Path, device: str = "cpu", speed: str = "exact") -> Rest
     """
     simulator, saved = loading.load((Simulator, ReleasedSimulator), path, device, speed)
     data = {key: value for key, value in current_data(saved.config["data"]).items() if key not in ("image_size", "fps")}
-    try:
+    with naming(str(path)):
         settings = from_dict(DataConfig, upgraded(DataConfig, data), "data")
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
     return Restored(simulator, settings, simulator.plan(), saved)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, naming
 from gsim3d.io.pickles import check_pickle
 
 BATCH_NORM_EPSILON = 1e-3  # of the original I3D
@@ -111,7 +111,7 @@ _FLOAT32 = 1  # data type of ONNX
 
 def read_onnx(content: bytes) -> dict[str, np.ndarray]:
     """Reads the float32 initializers of an ONNX file, in its order. Raises InputError if it is damaged."""
-    try:
+    with naming("not a readable ONNX file", (IndexError, KeyError, OverflowError, TypeError, ValueError)):
         (graph,) = (value for number, value in _fields(memoryview(content)) if number == 7)
         tensors = [list(_fields(value)) for number, value in _fields(graph) if number == 5]
         arrays = {}
@@ -121,8 +121,6 @@ def read_onnx(content: bytes) -> dict[str, np.ndarray]:
                 shape = [value for number, value in fields if number == 1]
                 arrays[str(found[8], "utf-8")] = np.frombuffer(found[9], "<f4").reshape(shape).copy()
         return arrays
-    except (IndexError, KeyError, OverflowError, TypeError, ValueError) as error:
-        raise InputError(f"not a readable ONNX file: {error}") from None
 
 
 def _fields(data: memoryview) -> Iterator[tuple[int, int | memoryview]]:
