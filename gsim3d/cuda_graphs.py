@@ -202,8 +202,9 @@ class CapturedRollout:
             if parts.nothing_moves:
                 raise InputError("CapturedRollout: state has no movable particles")
             self._state = _own(parts.moving)
+            # In the graph's static memory, as the frozen context.
             own = Partition(_own(parts.newest), self._state, _own(parts.background), parts.rows.clone())
-            self._frozen = _Frozen(own, self._remember(parts.background))
+            self._frozen, self._context = own, self._remember(parts.background)
         self._moving = self._capacity_for(int(self._count_moving()))
         self._resize(self._observed())
 
@@ -275,10 +276,10 @@ class CapturedRollout:
                 steps = self._model.rollout(self._state, self._n_steps, plan, **options)
             else:
                 guard = self._model._guard("rollout", None, report)
-                options = {"generator": None, "guard": guard, "geometry": geometry, "background": frozen.context}
+                options = {"generator": None, "guard": guard, "geometry": geometry, "background": self._context}
                 predict = functools.partial(self._model._predict, plan=plan, **options)
                 moving = rollout(predict, self._state, self._n_steps, plan.history)
-                steps = [frozen.partition.whole(step, 1 + i) for i, step in enumerate(moving)]
+                steps = [frozen.whole(step, 1 + i) for i, step in enumerate(moving)]
             if self._cameras is not None:
                 drawn = {"plan": self._drawn, "cutoff": self._cutoff, "report": report}
                 renderings += [self._model._draw(step, self._cameras, self._background, **drawn) for step in steps]
@@ -366,7 +367,7 @@ class CapturedRollout:
 
     def _load_parts(self, parts: Partition) -> Particles:
         """Copies the frozen particles into the graph's memory; returns the movable particles."""
-        own = self._frozen.partition
+        own = self._frozen
         self._check(parts.moving, own.moving.clouds, " among movable particles")
         known, given = own.background.row_fields(), parts.background.row_fields()
         changed = self._is_stale or not all(torch.equal(given[name], x) for name, x in known.items())
@@ -376,8 +377,8 @@ class CapturedRollout:
         if changed:
             self._is_stale = False
             remembered = self._remember(parts.background)
-            if not self._frozen.context.load(remembered):
-                self._frozen = _Frozen(own, remembered)
+            if not self._context.load(remembered):
+                self._context = remembered
                 self._resize(self._observed())
         return parts.moving
 
@@ -453,13 +454,6 @@ def fixed_geometry(dynamics: Dynamics, capacities: Sequence[PyramidCapacity]) ->
 def fit(capacities: Sequence[PyramidCapacity], found: Sequence[Sequence[int]]) -> bool:
     """Returns whether the sizes found by all geometries fit their capacities."""
     return all([capacity.fits(sizes) for capacity, sizes in zip(capacities, found, strict=True)])
-
-
-class _Frozen(NamedTuple):
-    """Frozen particles of a graph, in its static memory."""
-
-    partition: Partition
-    context: FrozenContext
 
 
 def _own(particles: Particles) -> Particles:

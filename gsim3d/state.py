@@ -449,24 +449,16 @@ class Particles(TensorRecord):
 
 def newest_clouds(clouds: CloudTable) -> list[int]:
     """Returns the last cloud of each scene that has clouds."""
-    return _newest(clouds.scenes, clouds.steps)
-
-
-def _newest(scenes: Sequence[int], steps: Sequence[int]) -> list[int]:
-    keys = list(zip(scenes, steps))
-    if any(b <= a for a, b in zip(keys, keys[1:])):
-        wanted, got = "sorted by (scene, step), without duplicates", f"scenes {list(scenes)}, steps {list(steps)}"
-        raise ValueError(f"particles: clouds must be {wanted}; got {got}")
-    return [q for q in range(len(scenes)) if q + 1 == len(scenes) or scenes[q + 1] != scenes[q]]
+    return _last(clouds.scenes, clouds.steps, 1)
 
 
 def _last(scenes: Sequence[int], steps: Sequence[int], n_steps: int) -> list[int]:
     """Returns the last ``n_steps`` clouds of each scene."""
-    kept, begin = [], 0
-    for last in _newest(scenes, steps):
-        kept += range(max(begin, last + 1 - n_steps), last + 1)
-        begin = last + 1
-    return kept
+    keys = list(zip(scenes, steps))
+    if any(b <= a for a, b in zip(keys, keys[1:])):
+        wanted, got = "sorted by (scene, step), without duplicates", f"scenes {list(scenes)}, steps {list(steps)}"
+        raise ValueError(f"particles: clouds must be {wanted}; got {got}")
+    return [q for q in range(len(scenes)) if scenes[q + n_steps : q + n_steps + 1] != scenes[q : q + 1]]
 
 
 def append_step(history: Particles, step: Particles, max_steps: int) -> Particles:

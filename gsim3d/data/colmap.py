@@ -130,7 +130,7 @@ def _cameras(file: Path) -> Iterator[tuple[int, dict]]:
     """Yields (camera id, keys as in transforms.json)."""
     if file.suffix == ".bin":
         data = _Binary(file)
-        for _ in range(data.count()):
+        for _ in range(data.take("Q")[0]):
             number, model, width, height = data.take("iiQQ")
             name, keys = MODELS[model] if 0 <= model < len(MODELS) else (str(model), "")
             yield number, _keys(file, number, name, keys, (width, height), data.take(f"{len(keys.split())}d"))
@@ -161,7 +161,7 @@ def _images(file: Path) -> Iterator[tuple[str, int, tuple, tuple]]:
     """Yields (name, camera id, quaternion (w, x, y, z), translation) of every image."""
     if file.suffix == ".bin":
         data = _Binary(file)
-        for _ in range(data.count()):
+        for _ in range(data.take("Q")[0]):
             _, *pose, camera = data.take("i7di")
             name = data.text()
             data.skip(24 * data.take("Q")[0])
@@ -183,7 +183,7 @@ def _points(file: Path) -> numbers_of:
     points = numbers_of("d")
     if file.suffix == ".bin":
         data = _Binary(file)
-        for _ in range(min(data.count(), MAX_POINTS)):
+        for _ in range(min(data.take("Q")[0], MAX_POINTS)):
             points.extend(data.take("8x3d3x8x"))
             data.skip(8 * data.take("Q")[0])
         return points
@@ -243,9 +243,6 @@ class _Binary:
                 raise self._short() from None
             except OSError as error:
                 raise InputError(f"{file} cannot be read: {error.strerror}") from None
-
-    def count(self) -> int:
-        return self.take("Q")[0]
 
     def take(self, form: str) -> tuple:
         try:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from gsim3d.cameras import Frames
 from gsim3d.data.recording import BACKGROUND, MOVING
@@ -98,7 +97,9 @@ def make_frames(
     if not images:
         raise InputError("make_frames needs at least one step")
     labels = torch.cat(labels) if masked else None
-    valid = _join_valid(valid, images)
+    whole = (torch.ones_like(of_cloud[:, 0], dtype=torch.bool) for of_cloud in images)
+    joint = torch.cat([of_all if one is None else one[0] for one, of_all in zip(valid, whole)])
+    valid = None if bool(joint.all()) else joint
     offsets = np.stack([scene.world_offset for scene in scenes])
     joined = {name: torch.cat([getattr(c, name) for c in cameras]) for name in ("viewmats", "Ks", "near", "far")}
     joined["image_cloud"] = torch.tensor(image_cloud, dtype=torch.int64)
@@ -133,15 +134,6 @@ def _join_actions(scenes: Sequence[Scene], steps_per_scene: Sequence) -> Actions
             given = torch.tensor([names.index(name) for name in actions.types])
             types[number, :, : len(given)] = torch.where(torch.from_numpy(actions.present[at]), given, -1)
     return Actions(positions, types, names)
-
-
-def _join_valid(valid: list[Tensor | None], images: list[Tensor]) -> Tensor | None:
-    """Concatenates validity masks to bool [I, H, W]; returns None if all pixels are valid."""
-    if all(one is None for one in valid):
-        return None
-    full = torch.ones(images[0][:, 0].shape[1:], dtype=torch.bool)
-    joint = torch.cat([full.expand(len(i), -1, -1) if v is None else v[0] for v, i in zip(valid, images)])
-    return None if bool(joint.all()) else joint
 
 
 def _cams_per_step(cams, n_steps: int, scene: Scene) -> list[list[int]]:

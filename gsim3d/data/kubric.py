@@ -127,10 +127,8 @@ class _CameraFiles:
         poses = np.broadcast_to(np.eye(4), (len(numbers), 4, 4)).copy()
         positions, what = self._entry.values.get("positions"), f"{self.source}: camera {self.name}"
         count = len(positions) if isinstance(positions, list) else 0
-        positions, quaternions = (
-            self._entry.array("positions", (count, 3)),
-            self._entry.array("quaternions", (count, 4)),
-        )
+        positions = self._entry.array("positions", (count, 3))
+        quaternions = self._entry.array("quaternions", (count, 4))
         if positions is None or quaternions is None or not 0 < count <= recording.MAX_STEPS:
             return poses
         late = [number for number in numbers if number >= count]

@@ -156,17 +156,13 @@ class Undistorter:
             make = cv2.fisheye.initUndistortRectifyMap if self._lens.fisheye else cv2.initUndistortRectifyMap
             # Distorts with focal length 1 and applies K afterwards, because OpenCV's lenses have no skew.
             x, y = make(np.eye(3), self._lens.coefficients, np.eye(3), centred, self._size, cv2.CV_32FC1)
-            folded = self._radius(K) > _reach(self._lens)
+            v = (np.arange(self._size[1])[:, None] + 0.5 - K[1, 2]) / K[1, 1]
+            u = (np.arange(self._size[0]) + 0.5 - K[0, 2]) / K[0, 0] - K[0, 1] / K[0, 0] * v
+            folded = np.hypot(u, v) > _reach(self._lens)  # tangents of the angles between rays and optical axis
             sources = centred[0, 0] * x + centred[0, 1] * y + centred[0, 2], centred[1, 1] * y + centred[1, 2]
             self._maps = tuple(np.where(folded, -2, source).astype(np.float32) for source in sources)
             self._key = K.copy()
         return self._maps
-
-    def _radius(self, K: np.ndarray) -> np.ndarray:
-        """Returns [h, w], the tangent of the angle between each pixel's ray and the optical axis."""
-        y = (np.arange(self._size[1]) + 0.5 - K[1, 2]) / K[1, 1]
-        x = (np.arange(self._size[0]) + 0.5 - K[0, 2]) / K[0, 0]
-        return np.hypot(x[None] - K[0, 1] / K[0, 0] * y[:, None], y[:, None])
 
 
 def _reach(lens: Lens) -> float:

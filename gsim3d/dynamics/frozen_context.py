@@ -188,11 +188,6 @@ def _overlap(
     return ops.overlapping_patches(*background, codes, *at, patch_size=places.patch_size)
 
 
-def _cell_keys(scene: Tensor, grid: Tensor) -> Tensor:
-    x, y, z = grid.unbind(1)
-    return scene << SPACE_BITS | x << 2 * DEPTH | y << DEPTH | z
-
-
 def _shifted(keys: Tensor, offsets: Tensor, depth: int) -> tuple[Tensor, Tensor]:
     """Keys [..., V] of the cells shifted by ``offsets`` [..., 3], and whether they lie inside the 2^depth cells."""
     inside = True
@@ -224,7 +219,8 @@ def _codes(stage: Stage, scene: Tensor, depth: int, curves: tuple[int, ...]) -> 
 
 def _field(stage: Stage, scene: Tensor, depth: int, kernel_size: int) -> Field:
     lowest, reach = stage.voxels.rows[stage.voxels.cu_rows[:-1]], kernel_size // 2
-    keys = _cell_keys(scene[lowest], stage.grid[lowest])  # ascending, as voxels are
+    x, y, z = stage.grid[lowest].unbind(1)
+    keys = scene[lowest] << SPACE_BITS | x << 2 * DEPTH | y << DEPTH | z  # ascending, as voxels are
     steps = torch.arange(-reach, reach + 1, device=keys.device)
     cells = keys
     for axis in range(3):

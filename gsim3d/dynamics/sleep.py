@@ -74,7 +74,8 @@ class Sleepers:
         moved = (after.activity != before.activity) > self.rule.eps  # a change of activity counts as 1
         for name in sorted(self.changing):
             allowed = self.reach if name == "means" else self.rule.eps
-            moved |= _largest(getattr(after, name) - getattr(before, name)) > allowed
+            change = (getattr(after, name) - getattr(before, name)).abs()
+            moved |= (change.flatten(1).amax(1) if change.dim() > 1 else change) > allowed
         self.last_change.masked_fill_(moved, self.n_steps)
         may_fall_asleep = self.n_steps % self.patience == 0
         if not (may_fall_asleep or self.any_asleep):
@@ -96,11 +97,6 @@ class Sleepers:
         here, ahead = (_cubes(positions, after.origin, scene, self.rule.halo) for positions in both)
         stirs = restless & (after.activity != ASLEEP)
         return ~_near(here, torch.cat([here[stirs], ahead[stirs]])) & ~restless & (after.activity != FROZEN)
-
-
-def _largest(change: Tensor) -> Tensor:
-    """Largest magnitude of each particle: [N, ...] -> [N]."""
-    return change.abs().flatten(1).amax(1) if change.dim() > 1 else change.abs()
 
 
 def _cubes(positions: Tensor, origin: Tensor, scene: Tensor, edge: float) -> Tensor:

@@ -164,11 +164,19 @@ class StateLayout:
             return self._later_quats(newest, predicted, share)
         share = share.reshape(*share.shape[:-1], *(1,) * (newest.dim() - 1))
         changed = newest[None] + share * self._differences(name, newest, predicted)
-        return hold(share, newest[None], self._in_range(name, changed))
+        if name == "scales":
+            changed = changed.clamp(self.config.scale_min, self.config.scale_max)
+        if name == "opacities":
+            changed = changed.clamp(0, self.config.max_opacity)
+        return hold(share, newest[None], changed)
 
     def _differences(self, name: str, newest: Tensor, predicted: Tensor) -> Tensor:
         """Change [S, N, ...] of an attribute from its newest values, for each step."""
-        predicted = _unflat(name, predicted)
+        if name == "sh":
+            damping = degree_damping(self.config.sh_degree, predicted)
+            predicted = predicted.unflatten(2, (3, -1)).mT * damping[:, None]
+        if name == "opacities":
+            predicted = predicted[:, :, 0]
         if self.config.predicts == "absolute":
             return self._target(name, predicted) - newest
         changes = self._change(name, predicted)
@@ -182,7 +190,7 @@ class StateLayout:
             return bounded(predicted, config.max_latent_step)
         if name == "scales" and config.max_step is not None:
             return bounded(predicted, SCALE_STEP_SHARE * (config.scale_max - config.scale_min))
-        return self._damped(predicted) if name == "sh" else predicted
+        return predicted
 
     def _target(self, name: str, predicted: Tensor) -> Tensor:
         config = self.config
@@ -190,17 +198,7 @@ class StateLayout:
             return predicted.sigmoid()
         if name == "scales":
             return config.scale_min + (config.scale_max - config.scale_min) * predicted.sigmoid()
-        return self._damped(predicted) if name == "sh" else predicted
-
-    def _damped(self, sh: Tensor) -> Tensor:
-        return sh * degree_damping(self.config.sh_degree, sh)[:, None]
-
-    def _in_range(self, name: str, value: Tensor) -> Tensor:
-        if name == "scales":
-            return value.clamp(self.config.scale_min, self.config.scale_max)
-        if name == "opacities":
-            return value.clamp(0, self.config.max_opacity)
-        return value
+        return predicted
 
     def _later_quats(self, newest: Tensor, predicted: Tensor, share: Tensor) -> Tensor:
         """:meth:`later_values` of quaternions, which are normalised where they change."""
@@ -221,13 +219,6 @@ def _flat(name: str, value: Tensor) -> Tensor:
     if name == "quats":
         return value.roll(-1, 1)
     return value.flatten(1) if value.dim() > 1 else value[:, None]
-
-
-def _unflat(name: str, value: Tensor) -> Tensor:
-    """[S, N, channels] -> [S, N, ...], inverse of :func:`_flat`."""
-    if name == "sh":
-        return value.unflatten(2, (3, -1)).mT
-    return value[:, :, 0] if name == "opacities" else value
 
 
 def position_features(particles: Particles, grid_size: float, length: float) -> Tensor:

@@ -81,7 +81,11 @@ def write_splats(
     parts = [gaussians] if isinstance(gaussians, Gaussians) else list(gaussians)
     turn = _turn(path, chosen, up, Z_TO_Y_UP)
     if suffix != ".ply":
-        _warn_of_offset(path, parts)
+        offsets = (p.world_offset for p in parts if p.world_offset is not None and bool(p.world_offset.any()))
+        if (offset := next(offsets, None)) is not None:
+            first = ", ".join(f"{x:.2f}" for x in offset[0].tolist())
+            message = f"{path}: positions count from ({first}) m in the world, which is not kept; a .ply keeps it"
+            warnings.warn(message, FitWarning, stacklevel=2)
     if not chosen.says_antialiased and any(part.antialiased for part in parts):
         message = f"{path}: {suffix} does not say that Gaussians are antialiased: small ones will appear too bright"
         warnings.warn(message, FitWarning, stacklevel=2)
@@ -99,15 +103,6 @@ def write_splats(
         return
     splats = splats_of(parts[0], frame, path)
     chosen.write(path, splats if turn is None else turned(splats, turn))
-
-
-def _warn_of_offset(path: Path, parts: Sequence[Gaussians]) -> None:
-    """Warns where Gaussians lose their ``world_offset``: only a .ply keeps it."""
-    offset = next((p.world_offset for p in parts if p.world_offset is not None and bool(p.world_offset.any())), None)
-    if offset is not None:
-        first = ", ".join(f"{x:.2f}" for x in offset[0].tolist())
-        message = f"{path}: positions count from ({first}) m in the world, which is not kept; a .ply keeps it"
-        warnings.warn(message, FitWarning, stacklevel=3)
 
 
 def read_splats(path: str | Path, *, up: str | None = None) -> Gaussians:

@@ -19,7 +19,10 @@ def machine(device: torch.device) -> dict[str, str]:
     """Versions, device and processor of a measurement. "sources" is a hash of the package's Python files."""
     import torch  # not above: workers that generate data run without torch
 
-    found = {"gsim3d": gsim3d.__version__, "sources": _hash_of_sources()}
+    digest = hashlib.sha256()
+    for file in sorted(PACKAGE.rglob("*.py")):
+        digest.update(file.relative_to(PACKAGE).as_posix().encode() + b"\0" + file.read_bytes())
+    found = {"gsim3d": gsim3d.__version__, "sources": digest.hexdigest()[:12]}
     found |= {"torch": torch.__version__, "python": platform.python_version()}
     if device.type == "cuda":
         return found | {"device": torch.cuda.get_device_name(device), "cuda": str(torch.version.cuda)}
@@ -32,10 +35,3 @@ def processor_name() -> str:
     lines = info.read_text().splitlines() if info.is_file() else []
     names = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
     return next(names, platform.processor() or platform.machine())
-
-
-def _hash_of_sources() -> str:
-    digest = hashlib.sha256()
-    for file in sorted(PACKAGE.rglob("*.py")):
-        digest.update(file.relative_to(PACKAGE).as_posix().encode() + b"\0" + file.read_bytes())
-    return digest.hexdigest()[:12]

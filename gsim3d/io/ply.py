@@ -17,7 +17,7 @@ from torch import Tensor
 from gsim3d.errors import InputError
 from gsim3d.io.arrays import FIELDS, MAX_BYTES, SMALLEST_SCALE, dc_of, relative, span_of, splats_of
 from gsim3d.io.files import read_file, write_whole
-from gsim3d.io.ply_format import MAX_HEADER, MIP, Header, read_columns, read_header
+from gsim3d.io.ply_format import MAX_HEADER, MIP, read_columns, read_header
 from gsim3d.math.rotations import unit_quats
 from gsim3d.state import Gaussians
 
@@ -37,7 +37,11 @@ def write_ply(path: str | Path, gaussians: Gaussians, cloud: int | None = None) 
     """
     path = Path(path)
     splats = splats_of(gaussians, cloud, path)
-    positions = splats.means if gaussians.world_offset is None else _in_world(gaussians, span_of(gaussians, cloud))
+    positions = splats.means
+    if gaussians.world_offset is not None:
+        offset = gaussians.world_offset.double().repeat_interleave(gaussians.cu_rows.diff(), 0)
+        world = gaussians.means.detach().double() + offset
+        positions = world[span_of(gaussians, cloud)].cpu().numpy()
     if not np.isfinite(positions).all():
         raise InputError(f"{path}: cannot write Gaussians, world_offset holds values that are not finite")
     opacities = torch.from_numpy(splats.opacities).double().clamp(OPACITY_MARGIN, 1 - OPACITY_MARGIN)
@@ -57,12 +61,6 @@ def write_ply(path: str | Path, gaussians: Gaussians, cloud: int | None = None) 
     write_whole(path, "\n".join(header), table.tobytes())
 
 
-def _in_world(gaussians: Gaussians, chosen: slice) -> np.ndarray:
-    """float64 [N, 3], positions with the offsets of their clouds."""
-    offset = gaussians.world_offset.double().repeat_interleave(gaussians.cu_rows.diff(), 0)
-    return (gaussians.means.detach().double() + offset)[chosen].cpu().numpy()
-
-
 def read_ply(path: str | Path) -> Gaussians:
     """Reads Gaussians of a .ply as one cloud: 3DGS or 2DGS, binary or text, properties in any order, others ignored.
 
@@ -78,22 +76,16 @@ def read_ply(path: str | Path) -> Gaussians:
     try:
         header = read_header(path, read_file(path, MAX_BYTES, MAX_HEADER))
         content = read_file(path, MAX_BYTES)
-        is_mip = _is_mip(path, header)
+        names = {name for element in header.elements for name, _, _ in element.properties}
+        if packed := sorted(name for name in names if name.startswith("packed_")):
+            wanted = "write it uncompressed first, for example with splat-transform"
+            raise InputError(f"{path}: a compressed .ply (it has {packed[0]}); {wanted}")
         table = read_columns(path, content, header, "vertex").get("vertex")
         if table is None:
             raise InputError(f"{path}: the header has no usable element vertex")
-        return dataclasses.replace(_gaussians(path, table), antialiased=is_mip)
+        return dataclasses.replace(_gaussians(path, table), antialiased="filter_3D" in names or header.is_mip)
     except MemoryError:
         raise InputError(f"{path} cannot be read: no memory for its Gaussians") from None
-
-
-def _is_mip(path: Path, header: Header) -> bool:
-    """Whether Gaussians were trained with Mip-Splatting's compensation. Raises InputError for a compressed file."""
-    names = {name for element in header.elements for name, _, _ in element.properties}
-    if packed := sorted(name for name in names if name.startswith("packed_")):
-        wanted = "write it uncompressed first, for example with splat-transform"
-        raise InputError(f"{path}: a compressed .ply (it has {packed[0]}); {wanted}")
-    return "filter_3D" in names or header.is_mip
 
 
 def _gaussians(path: Path, table: dict[str, np.ndarray]) -> Gaussians:

@@ -84,7 +84,11 @@ def _reading(level: int, dtype: torch.dtype, device: torch.device) -> tuple[Tens
     The same tensors at every call, so nothing is sent to the device: read them, never write to them.
     """
     with torch.inference_mode(False), torch.no_grad():
-        directions = _spiral(level)
+        turn, start = SPIRALS[level]
+        i = torch.arange(2 * level + 1, dtype=torch.float64, device="cpu")
+        z = (i + start) / (2 * level + 1)
+        radius = (1 - z * z).clamp(min=0).sqrt()
+        directions = torch.stack([radius * torch.cos(turn * i), radius * torch.sin(turn * i), z], -1)
         read = torch.linalg.inv(sh_basis(directions, level)[:, level**2 :]).T
         return directions.to(device, dtype), read.to(device, dtype)
 
@@ -96,12 +100,3 @@ def readings(dtype: torch.dtype, device: torch.device) -> Tensor:
     with torch.inference_mode(False):
         parts = [part.flatten() for level in range(1, MAX_DEGREE + 1) for part in _reading(level, dtype, device)]
         return torch.cat(parts)
-
-
-def _spiral(level: int) -> Tensor:
-    """float64 [2 l + 1, 3] directions of the upper half sphere."""
-    turn, start = SPIRALS[level]
-    i = torch.arange(2 * level + 1, dtype=torch.float64, device="cpu")
-    z = (i + start) / (2 * level + 1)
-    radius = (1 - z * z).clamp(min=0).sqrt()
-    return torch.stack([radius * torch.cos(turn * i), radius * torch.sin(turn * i), z], -1)

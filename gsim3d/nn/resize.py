@@ -39,11 +39,8 @@ def _weights(n: int, m: int, kind: Kind, offset: float, dtype: torch.dtype, devi
             weights = (1 - distance).clamp(min=0)
             return (weights / weights.sum(1, keepdim=True)).to(device, dtype)
         taps = at.floor().long()[:, None] + torch.arange(-1, 3)
-        weights = torch.zeros(m, n, dtype=torch.float64)
-        return weights.scatter_add_(1, taps.clamp(0, n - 1), _cubic((at[:, None] - taps).abs())).to(device, dtype)
-
-
-def _cubic(distance: Tensor) -> Tensor:
-    near = ((CUBIC + 2) * distance - (CUBIC + 3)) * distance**2 + 1
-    far = ((distance - 5) * distance + 8) * distance * CUBIC - 4 * CUBIC
-    return torch.where(distance <= 1, near, torch.where(distance < 2, far, 0))
+        weights, distance = torch.zeros(m, n, dtype=torch.float64), (at[:, None] - taps).abs()
+        near = ((CUBIC + 2) * distance - (CUBIC + 3)) * distance**2 + 1
+        far = ((distance - 5) * distance + 8) * distance * CUBIC - 4 * CUBIC
+        cubic = torch.where(distance <= 1, near, torch.where(distance < 2, far, 0))
+        return weights.scatter_add_(1, taps.clamp(0, n - 1), cubic).to(device, dtype)

@@ -89,11 +89,6 @@ def _numbers_of(records: Iterable[_Record]) -> list[Tensor]:
     return numbers
 
 
-def _read_packed(read: Callable, packed: Tensor, begin: int, shape: torch.Size, dtype: torch.dtype) -> Reading:
-    """Reads the record that begins at ``begin`` of ``packed``."""
-    return read(packed[begin : begin + shape.numel()].view(dtype).view(shape))
-
-
 @dataclass
 class _Pending:
     """Records that are copied to the host; ``event`` ends the copy (None: complete)."""
@@ -251,7 +246,8 @@ class StabilityReport:
         numbers, begin = pending.packed.tolist(), 0
         for record in pending.records:
             shape, dtype = record.numbers.shape, record.numbers.dtype
-            reading = partial(_read_packed, record.read, pending.packed, begin, shape, dtype)
+            own = pending.packed[begin : begin + shape.numel()].view(dtype).view(shape)
+            reading = partial(record.read, own)
             if record.counts and not any([numbers[begin + index] for index in record.counts]):
                 self._quiet.append(reading)
             else:

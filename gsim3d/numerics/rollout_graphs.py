@@ -32,9 +32,6 @@ class RolloutGraphs:
         self._graph: CapturedRollout | CaptureError | None = None
         self._versions: list[int] = []
 
-    def __deepcopy__(self, memo: dict) -> RolloutGraphs:
-        return RolloutGraphs()
-
     def __reduce__(self) -> tuple:
         return RolloutGraphs, ()
 

@@ -54,7 +54,7 @@ def load(
     """
     check_device(device)
     saved = checkpoint.load(name_or_path)
-    released = is_released(saved.config)
+    released = current_model(saved.config["model"]).get("release") is True
     cls = next((kind for kind in kinds if released == (kind.config_class is not ModelConfig)), None)
     if cls is None:
         wanted = "gsim3d.compat.load_released" if released else "Simulator.from_pretrained"
@@ -82,11 +82,6 @@ def save(simulator: nn.Module, folder: Path) -> Path:
     config = Description(simulator.config, simulator.effects, simulator.inputs).to_dict()
     folder.parent.mkdir(parents=True, exist_ok=True)
     return checkpoint.write(folder, checkpoint.Checkpoint(simulator.state_dict(), config, {"step": 0}))
-
-
-def is_released(config: dict[str, Any]) -> bool:
-    """Returns whether a saved configuration is one of the published model."""
-    return current_model(config["model"]).get("release") is True
 
 
 def describe(config: dict[str, Any], kind: type[ModelConfig] = ModelConfig, fps: float | None = None) -> Description:

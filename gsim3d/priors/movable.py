@@ -85,7 +85,10 @@ class Windows:
             samples, size = movable.samples, radius
             self._at, self._sampled = movable.positions, samples.positions
             if history.body is not None:
-                self._at, size = _from_center(movable, history, history.body), APART * radius
+                rows, known = movable.particles.rows, movable.particles.known[:, :, None]
+                bodies = history.body.detach()[rows].double() - history.origin[movable.scenes][:, None]
+                self._at = torch.where(known, bodies, 0).to(movable.center.dtype) - movable.center
+                size = APART * radius
                 self._sampled = samples.take(self._at)
             self._grid = ControlGrid(self._sampled, samples.known)
             self.nodes = self._grid.nodes
@@ -107,13 +110,6 @@ class Windows:
         sampled = self.movable.samples.take(self.movable.gather(values.expand(-1, 3)))
         (found,) = self.to_particles(self.weights @ sampled)
         return self.movable.scatter(found)[:, :1]
-
-
-def _from_center(movable: Movable, history: Particles, positions: Tensor) -> Tensor:
-    """Positions [B, m, 3] of the movable particles relative to the center, from packed ``positions``."""
-    rows = movable.particles.rows
-    found = positions.detach()[rows].double() - history.origin[movable.scenes][:, None]
-    return torch.where(movable.particles.known[:, :, None], found, 0).to(movable.center.dtype) - movable.center
 
 
 class ControlGrid:

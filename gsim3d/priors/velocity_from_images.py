@@ -13,7 +13,7 @@ from gsim3d.priors.base import Prior, PriorConfig, StepContext
 from gsim3d.priors.movable import Windows
 from gsim3d.priors.padding import PaddedClouds, Samples, Subset, squared_distances, weights
 from gsim3d.priors.rigid import next_displacement, solve3
-from gsim3d.state import CloudTable, Particles, constant
+from gsim3d.state import Particles, constant
 
 PASSES = 5  # Gauss-Newton iterations of the alignment
 SHIFT_PASSES = 3  # mean-shift iterations that follow a window from cloud to cloud
@@ -82,7 +82,8 @@ def estimate_velocity(
     """
     particles, clouds, newest = ctx.history, ctx.history.clouds, ctx.newest
     result = torch.zeros_like(particles.means)
-    oldest = [_oldest(clouds, start, q, ctx.max_steps) for start, q in zip([0, *(q + 1 for q in newest)], newest)]
+    steps, histories = clouds.steps, zip([0, *(q + 1 for q in newest)], newest)
+    oldest = [next(f for f in range(begin, q + 1) if steps[q] - steps[f] < ctx.max_steps) for begin, q in histories]
     if oldest == newest or ctx.is_empty:
         return result
     with torch.autocast(particles.means.device.type, enabled=False):
@@ -96,25 +97,21 @@ def estimate_velocity(
             then = Samples(Subset(PaddedClouds(particles, earlier, ctx.grid_size), particles))
             then.center(movable.center)
             before = _Views(frames, particles, *images, earlier, movable.center, config)
-            spans = constant(tuple(clouds.steps[q] - clouds.steps[e] for e, q in zip(earlier, newest)), spin.device)
+            spans = constant(tuple(steps[q] - steps[e] for e, q in zip(earlier, newest)), spin.device)
             start = _shift(now, then, windows.nodes, config.radius), spans[:, None, None] * spin
-            per_step = _per_step(clouds, earlier, newest, now, then)
+            known = (spans > 0) & (now.n > 0) & (then.n > 0)
+            per_step = (known / spans.clamp(min=1))[:, None, None].to(now.positions.dtype)
             velocity, spin = (x * per_step for x in _align(windows, center, *start, seen, before, config))
         velocity, spin, pivot = windows.to_particles(velocity, spin, center)
         displacement = -next_displacement(movable.positions, -velocity, -spin, pivot)
         if fall is not None:
-            spans = [clouds.steps[q] - clouds.steps[f] for f, q in zip(oldest, newest)]
+            spans = [steps[q] - steps[f] for f, q in zip(oldest, newest)]
             remaining = constant(tuple(max(0, span - 1) for span in spans), displacement.device)
             displacement = displacement + 0.5 * remaining[:, None, None] * movable.gather(fall)
         displacement = movable.scatter(displacement)
     for q, part in zip(newest, displacement.split([clouds.count(q) for q in newest]), strict=True):
         result[clouds.starts[q] : clouds.starts[q + 1]] = part
     return result
-
-
-def _oldest(clouds: CloudTable, begin: int, newest: int, n_steps: int) -> int:
-    """First cloud from ``begin`` on that is less than ``n_steps`` steps older than ``newest``."""
-    return next(q for q in range(begin, newest + 1) if clouds.steps[newest] - clouds.steps[q] < n_steps)
 
 
 def _align(
@@ -203,7 +200,7 @@ class _Views:
             moves = moves * frames.dynamic[chosen_images][:, :, None]
         shown = _smoothed(moves, config.blur)
         colours = _smoothed(pixels / (pixels.sum(2, keepdim=True) + GREY) * moves, config.blur) / shown.clamp(min=SHOWN)
-        self._values = torch.cat([colours, _slope(colours, 4), _slope(colours, 3), shown], 2)
+        self._values = torch.cat([colours, *torch.gradient(colours, dim=(4, 3)), shown], 2)
         viewmats = cameras.viewmats[chosen_images].double()
         rotation, start = viewmats[..., :3, :3], (center.double() + particles.origin[scenes][:, None])[..., None]
         way = (rotation @ start)[..., 0] + viewmats[..., :3, 3]
@@ -250,11 +247,6 @@ def _smoothed(images: Tensor, blur: float) -> Tensor:
     return down @ images @ across.T
 
 
-def _slope(images: Tensor, axis: int) -> Tensor:
-    """Central differences, one-sided at the border."""
-    return torch.gradient(images, dim=axis)[0]
-
-
 def _shift(now: Samples, then: Samples, nodes: Tensor, length: float) -> Tensor:
     """Displacement [B, G, 3] of the particles in the window of each node, by mean shift."""
     around = _mean_around(nodes, now, length)
@@ -266,11 +258,3 @@ def _shift(now: Samples, then: Samples, nodes: Tensor, length: float) -> Tensor:
 
 def _mean_around(nodes: Tensor, samples: Samples, length: float) -> Tensor:
     return weights(squared_distances(nodes, samples.positions) * (-0.5 / length**2), samples.known) @ samples.positions
-
-
-def _per_step(clouds: CloudTable, earlier: list[int], newest: list[int], now: Samples, then: Samples) -> Tensor:
-    """1 / steps between two clouds [B, 1, 1]; 0 if they are the same or one has no movable particles."""
-    gaps = tuple(clouds.steps[q] - clouds.steps[e] for q, e in zip(newest, earlier, strict=True))
-    gaps = constant(gaps, now.n.device)
-    known = (gaps > 0) & (now.n > 0) & (then.n > 0)
-    return (known / gaps.clamp(min=1))[:, None, None].to(now.positions.dtype)

@@ -78,7 +78,10 @@ def write(out: Path, rows: Sequence[Row], about: dict) -> tuple[dict, list[Path]
         if not own:
             continue
         if table == MAIN:
-            _add_times(own, [row for row in rows if (row.table, row.world) == (SPEED, world)])
+            speeds = [row for row in rows if (row.table, row.world) == (SPEED, world) and row.cells]
+            times = {row.model: _numbers(row.cells, "")[0] for row in speeds}
+            for line in (line for line in own if line.label in times):
+                line.numbers |= {key: times[line.label][key] for key in ("step_ms", "parameters")}
         pictures = _figures(out / "figures", table, world, own)
         parts += [f"## {table}: {world}", _table(own), _remarks(own) if table == MAIN else ""]
         parts += [f"![{path.stem}](figures/{path.name})" for path in pictures]
@@ -151,13 +154,6 @@ def _difference(line: Line, other: dict[str, float]) -> tuple[float, float | Non
     both = ((value, other.get(scene)) for scene, value in line.by_scene.items())
     pairs = [a - b for a, b in both if a is not None and b is not None]
     return paired(pairs) if pairs else None
-
-
-def _add_times(lines: Sequence[Line], speeds: Sequence[Row]) -> None:
-    """Adds the time of a step and the number of parameters to the lines of models."""
-    found = {row.model: _numbers(row.cells, "")[0] for row in speeds if row.cells}
-    for line in lines:
-        line.numbers |= {key: found[line.label][key] for key in ("step_ms", "parameters") if line.label in found}
 
 
 def _table(lines: Sequence[Line]) -> str:
