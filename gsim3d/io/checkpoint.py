@@ -250,14 +250,15 @@ def _bytes_of(tensors: dict[str, Tensor], metadata: dict[str, str] | None = None
 
     Raises NumericalError where a tensor is not finite.
     """
-    if name := _first_not_finite(tensors):
+    if name := first_not_finite(tensors):
         advice = "nothing is written: lower the learning rate and go on from the last checkpoint"
         raise NumericalError(f"{name}: holds numbers that are not finite; {advice}", tensor=name)
     return safetensors.torch.save({k: v.detach().cpu().contiguous().clone() for k, v in tensors.items()}, metadata)
 
 
-def _first_not_finite(tensors: dict[str, Tensor]) -> str | None:
-    floating = ((name, value) for name, value in tensors.items() if value.is_floating_point())
+def first_not_finite(tensors: dict[str, Tensor | None]) -> str | None:
+    """Returns the name of the first tensor that is not finite; None if all are finite or None."""
+    floating = ((name, value) for name, value in tensors.items() if value is not None and value.is_floating_point())
     return next((name for name, value in floating if not bool(value.isfinite().all())), None)
 
 
@@ -289,7 +290,7 @@ def _read_tensors(path: Path) -> dict[str, Tensor]:
         tensors = load_file(path)
     except (safetensors.SafetensorError, OSError, ValueError, KeyError) as error:
         raise InputError(f"{path}: cannot be read: {' '.join(str(error).split())[:300]}") from None
-    if name := _first_not_finite(tensors):
+    if name := first_not_finite(tensors):
         raise InputError(f"{path}: {name} holds numbers that are not finite: the weights are broken")
     return tensors
 

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -101,6 +102,4 @@ def _plain(value: Any) -> Any:
 
 
 def _tensor(values: list) -> Tensor:
-    if values and isinstance(values[0], list):
-        return torch.stack([_tensor(row) for row in values])
-    return torch.tensor([math.nan if v is None else v for v in values], dtype=torch.float64)
+    return torch.from_numpy(np.array(values, np.float64))  # None becomes NaN

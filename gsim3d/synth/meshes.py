@@ -1,5 +1,6 @@
 """Bodies from mesh files with textures, and their collision meshes and convex pieces."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -85,14 +86,12 @@ def load_body(path: str | Path, up: str = "y", *, fill_holes: bool = False) -> B
 
 def _with_patterns(pieces: list[Piece], triangles: np.ndarray) -> list[Piece]:
     """Gives pieces without colours a pattern, a function of the positions ``triangles``."""
-    colors, found, begin = PALETTE[[5, 8, 1]], [], 0
-    for piece in pieces:
-        end = begin + len(piece.triangles)
-        if piece.paint is None:
-            piece = Piece(piece.triangles, triangles[begin:end], lambda p: PATTERNS["patches"](p, colors))
-        found.append(piece)
-        begin = end
-    return found
+    parts = np.split(triangles, np.cumsum([len(piece.triangles) for piece in pieces])[:-1])
+    pattern = partial(PATTERNS["patches"], colors=PALETTE[[5, 8, 1]])
+    return [
+        Piece(piece.triangles, part, pattern) if piece.paint is None else piece
+        for piece, part in zip(pieces, parts, strict=True)
+    ]
 
 
 def _filled(positions: np.ndarray, faces: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -3,6 +3,7 @@
 The bounding box of a body is centred at the origin, and the body fits a sphere of diameter 1.
 """
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -62,9 +63,7 @@ def _blob(d):
 
 def _star(d):
     # Fourteen soft arms towards the corners and faces of a cube.
-    arms = [(i, j, k) for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]
-    arms += [(s, 0, 0) for s in (-1, 1)] + [(0, s, 0) for s in (-1, 1)] + [(0, 0, s) for s in (-1, 1)]
-    arms = np.array(arms, dtype=np.float64)
+    arms = np.array([*itertools.product((-1.0, 1.0), repeat=3), *np.eye(3), *-np.eye(3)])
     arms /= np.linalg.norm(arms, axis=1, keepdims=True)
     closeness = np.max((d[:, None] * arms[None]).sum(-1), axis=1)
     return 0.72 + 0.42 * np.exp((closeness - 1) * 14)

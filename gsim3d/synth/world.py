@@ -26,7 +26,6 @@ BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 MESH_UPS = ("y", "z")
 ENGINES = {"mujoco": "gsim3d.synth.mujoco_engine", "genesis": "gsim3d.synth.genesis_engine"}
 CLOTH_REFINEMENT = 3  # resolution of the rendered cloth over the simulated one
-GAP = 0.03  # smallest initial distance between the bounding spheres of two bodies in metres
 TRAIN = "train"
 CLOTH_COLOR = (0.78, 0.14, 0.12)  # of worlds with ``by_name``
 LATER_OPTIONS = ("by_name", "ground_albedo")  # not in fingerprints at their defaults, so that older sets stay valid

@@ -17,13 +17,12 @@ import torch
 from torch import Tensor
 
 from gsim3d.cameras import Cameras, Frames
-from gsim3d.dynamics import last_steps
 from gsim3d.effects.plan import Plan
 from gsim3d.math.rotations import quat_product, rotation_matrices, rotation_to_quat
 from gsim3d.math.spherical_harmonics import rotate_harmonics
 from gsim3d.nn.gaussian_head import render
 from gsim3d.simulator import Simulator
-from gsim3d.state import DYNAMIC, CloudTable, Gaussians, Particles, attributes_of, newest_clouds, take_runs
+from gsim3d.state import DYNAMIC, CloudTable, Gaussians, Particles, attributes_of, last_steps, newest_clouds, take_runs
 
 EXACT = {torch.float32: 0.0, torch.float64: 1e-12}  # rounding of BLAS in float64 depends on the number of rows
 BOUND = 1e-4  # error over the largest value, for float32 sums in another order; worst seen 7e-6, small random models
@@ -209,11 +208,6 @@ def voxel_shift(simulator: Simulator, like: Tensor) -> Tensor:
     return ((cells * grid / GRAIN).round() * GRAIN).to(like.device)
 
 
-def on_grain(particles: Particles) -> Particles:
-    """Rounds positions to multiples of GRAIN."""
-    return _with_positions(particles, lambda positions: (positions / GRAIN).round() * GRAIN)
-
-
 def _with_positions(particles: Particles, change: Callable[[Tensor], Tensor]) -> Particles:
     """Applies ``change`` (float64 -> float64) to all attributes of kind "point"."""
     points = {name: value for name in attributes_of("point") if (value := getattr(particles, name)) is not None}
@@ -278,7 +272,7 @@ def translate(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
     expected = simulator.encode(frames)
     yield from compare_particles("encode", _moved(simulator.encode(moved), -shift), expected, BOUND)
     for state in _states(simulator, sample):
-        state = on_grain(state)
+        state = _with_positions(state, lambda positions: (positions / GRAIN).round() * GRAIN)
         step, there = simulator.step(state, sample.plan), simulator.step(_moved(state, shift), sample.plan)
         step, there = last_steps(step, 1), last_steps(there, 1)
         moved = [name for name in step.row_fields() if name in FROM_POSITIONS]

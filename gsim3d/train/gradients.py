@@ -1,7 +1,7 @@
 """Gradients of a training step: truncated backpropagation, activation checkpointing, norms and statistics."""
 
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -11,9 +11,8 @@ import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from gsim3d.dynamics import concatenate
 from gsim3d.numerics.report import StabilityReport
-from gsim3d.state import Particles
+from gsim3d.state import Particles, concatenate
 
 
 def in_segments(
@@ -137,11 +136,6 @@ def mean_of_samples(results: Sequence[tuple]) -> tuple[Tensor, Tensor, Sequence[
     return sum(losses) / len(results), sum(errors) / len(results), means
 
 
-def total_norm(gradients: Iterable[Tensor | None]) -> Tensor:
-    """Returns the global norm of all gradients."""
-    return torch.nn.utils.get_total_norm([gradient for gradient in gradients if gradient is not None])
-
-
 def norms_by_module(gradients: Mapping[str, Tensor | None]) -> dict[str, float]:
     """Returns the gradient norm of each top-level module."""
     parts: dict[str, list[Tensor]] = {}
@@ -150,11 +144,3 @@ def norms_by_module(gradients: Mapping[str, Tensor | None]) -> dict[str, float]:
             parts.setdefault(name.split(".")[0], []).append(gradient.detach())
     norms = {name: torch.stack(torch._foreach_norm(values, 2, torch.double)) for name, values in parts.items()}
     return {name: math.sqrt(values.square().sum().item()) for name, values in norms.items()}
-
-
-def first_not_finite(gradients: Iterable[tuple[str, Tensor | None]]) -> str | None:
-    """Returns the name of the first parameter whose gradient is not finite; None if all are finite."""
-    for name, gradient in gradients:
-        if gradient is not None and not bool(gradient.isfinite().all()):
-            return name
-    return None

@@ -16,7 +16,6 @@ from torch import Tensor
 from tqdm import tqdm
 
 from gsim3d.data import Scene, generator
-from gsim3d.dynamics import concatenate
 from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError, NumericalError, RunStopped
 from gsim3d.evaluate.perceptual.lpips import LPIPS
@@ -25,19 +24,18 @@ from gsim3d.io import checkpoint
 from gsim3d.io.locks import only_one_writer
 from gsim3d.nn.multiview_encoder.depth_weights import load_depth_weights
 from gsim3d.pretrained.loading import check_device
+from gsim3d.state import concatenate
 from gsim3d.train.captured import CapturedLoss, Prepared
 from gsim3d.train.config import PhaseConfig, TrainConfig, check_same_run, check_settings
 from gsim3d.train.features import FeatureCache
 from gsim3d.train.gradients import (
     Seen,
     StepWatch,
-    first_not_finite,
     in_segments,
     mean_of_norms,
     mean_of_samples,
     norms_by_module,
     recomputing,
-    total_norm,
 )
 from gsim3d.train.left_out import draw_left_out, images_per_cloud, with_views
 from gsim3d.train.log import (
@@ -231,7 +229,7 @@ class Trainer:
         errors = torch.full((n_past + phase.horizon,), math.nan)
         try:
             loss, errors, gradients, seen = self._whole_batch(phase.batch)
-            norm = total_norm(gradients)
+            norm = torch.nn.utils.get_total_norm([gradient for gradient in gradients if gradient is not None])
             problem = self._check(entry, loss, gradients, norm, seen)
         except NumericalError as error:
             problem = str(error)
@@ -278,7 +276,7 @@ class Trainer:
         if not math.isfinite(entry["loss"]):
             return "the loss is not finite"
         if not math.isfinite(entry["grad_norm"]):
-            return f"the gradient is not finite, first that of {first_not_finite(named.items())}"
+            return f"the gradient is not finite, first that of {checkpoint.first_not_finite(named)}"
         return None
 
     @property

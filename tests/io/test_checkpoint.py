@@ -220,7 +220,7 @@ def test_weights_that_are_not_finite_are_neither_written_nor_read(tmp_path, part
             checkpoint.export(dataclasses.replace(wrong, ema=getattr(wrong, part)), tmp_path / "a.safetensors")
         assert not list(tmp_path.glob("*.safetensors"))
     with monkeypatch.context() as patch:
-        patch.setattr(checkpoint, "_first_not_finite", lambda tensors: None)
+        patch.setattr(checkpoint, "first_not_finite", lambda tensors: None)
         folder = checkpoint.save(tmp_path, wrong)
     with pytest.raises(InputError, match=f"{part}.safetensors: {name} holds numbers that are not finite"):
         checkpoint.load(folder)
