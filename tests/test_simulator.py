@@ -9,13 +9,12 @@ import torch
 from gsim3d import presets
 from gsim3d.cameras import Cameras, Frames
 from gsim3d.compat.released_model import ReleasedDynamicsConfig, ReleasedModelConfig, ReleasedSimulator, render_released
-from gsim3d.dynamics import last_steps
 from gsim3d.effects.spec import AppearanceEffects, DynamicsEffects, EffectsSpec, UnsupportedEffect
 from gsim3d.nn.gaussian_head import RendererConfig, render
 from gsim3d.presets import ModelConfig
 from gsim3d.priors import GravityConfig, InertiaConfig, ProximityConfig, ShapeMatchingConfig, VelocityFromImagesConfig
 from gsim3d.simulator import Simulator
-from gsim3d.state import DYNAMIC, FROZEN
+from gsim3d.state import DYNAMIC, FROZEN, last_steps
 from gsim3d.train.loop import deterministic
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, with_threads
 from tests.dynamics.scenes import TINY

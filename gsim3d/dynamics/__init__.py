@@ -6,7 +6,6 @@ from gsim3d.dynamics.model import Dynamics
 from gsim3d.dynamics.partition import Partition
 from gsim3d.dynamics.rollout import rollout, rollout_in_parts
 from gsim3d.dynamics.sleep import RestLog, Sleepers
-from gsim3d.state import append_step, concatenate, last_steps, with_attribute
 
 __all__ = [
     "FrozenContext",
@@ -15,10 +14,6 @@ __all__ = [
     "Partition",
     "RestLog",
     "Sleepers",
-    "append_step",
-    "concatenate",
-    "last_steps",
     "rollout",
     "rollout_in_parts",
-    "with_attribute",
 ]

@@ -8,12 +8,12 @@ from statistics import fmean
 
 from gsim3d.data import Scene
 from gsim3d.data.recording import evenly_spaced
-from gsim3d.dynamics import concatenate, last_steps
 from gsim3d.effects.plan import make_plan
 from gsim3d.effects.spec import EffectsSpec
 from gsim3d.evaluate.protocol import default_views, encode_steps, horizon, render_steps
 from gsim3d.io.terminal import in_columns
 from gsim3d.presets import ModelConfig
+from gsim3d.state import concatenate, last_steps
 from gsim3d.train.restore import Restored
 
 WINDOWS, STEPS = 3, 4  # windows over the video, and predicted steps in each

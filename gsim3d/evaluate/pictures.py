@@ -13,7 +13,6 @@ from torch import Tensor
 
 from gsim3d.cameras import Cameras
 from gsim3d.data import Scene
-from gsim3d.dynamics import last_steps
 from gsim3d.errors import InputError
 from gsim3d.evaluate.protocol import Prediction, render_steps
 from gsim3d.evaluate.scoring import METRICS
@@ -24,6 +23,7 @@ from gsim3d.io.sequence import write_about
 from gsim3d.io.terminal import progress
 from gsim3d.nn.gaussian_head import render
 from gsim3d.numerics.trust import draw_values
+from gsim3d.state import last_steps
 from gsim3d.train.restore import Restored
 from gsim3d.viewer.films import film_frames, turbo
 from gsim3d.viewer.player import View, write_player

@@ -26,7 +26,7 @@ from torch import Tensor
 from gsim3d.cameras import Frames
 from gsim3d.data import Scene, make_frames
 from gsim3d.data.recording import BACKGROUND, MOVING
-from gsim3d.dynamics import RestLog, concatenate
+from gsim3d.dynamics import RestLog
 from gsim3d.effects.edits import Edit
 from gsim3d.errors import FitWarning, InputError, NumericalError
 from gsim3d.evaluate.physics import measure_tracks, moving_points
@@ -35,7 +35,7 @@ from gsim3d.evaluate.scoring import ALONE, EXACT_PARTS, NEEDS_LABELS, PLAIN_METR
 from gsim3d.io.terminal import progress
 from gsim3d.numerics.speed import draw, encode_histories
 from gsim3d.numerics.trust import MOST_LEFT_OUT, VARIANTS, rollout_with_spread
-from gsim3d.state import DYNAMIC, Particles
+from gsim3d.state import DYNAMIC, Particles, concatenate
 from gsim3d.train.processes import Processes
 from gsim3d.train.restore import Restored
 from gsim3d.train.samples import context_cameras, spread_views

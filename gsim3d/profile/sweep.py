@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gsim3d.cameras import Cameras, Frames
 from gsim3d.data import Scene
-from gsim3d.dynamics import RestLog, last_steps
+from gsim3d.dynamics import RestLog
 from gsim3d.errors import CaptureError, InputError, NumericalError
 from gsim3d.evaluate.metrics import mean_of_counted, psnr
 from gsim3d.evaluate.perceptual.fvd import MIN_CLIPS, frechet_distance
@@ -30,7 +30,7 @@ from gsim3d.io.settings import from_dict
 from gsim3d.numerics.speed import Setting
 from gsim3d.profile.settings import GROUPS, Group, Runner
 from gsim3d.profile.timing import GAPS, DeviceClock, GraphStopwatch, Stopwatch, Timing, medians_of, time_call, watched
-from gsim3d.state import DYNAMIC, Particles
+from gsim3d.state import DYNAMIC, Particles, last_steps
 from gsim3d.train.restore import Restored
 
 MAX_CACHED = 8  # encoded scenes kept in memory

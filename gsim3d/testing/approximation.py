@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from gsim3d.cameras import Cameras
-from gsim3d.dynamics import RestLog, last_steps
+from gsim3d.dynamics import RestLog
 from gsim3d.effects.plan import Plan
 from gsim3d.errors import InputError
 from gsim3d.simulator import Simulator
-from gsim3d.state import FROZEN, Particles
+from gsim3d.state import FROZEN, Particles, last_steps
 
 
 @dataclass(frozen=True)

@@ -12,12 +12,11 @@ import torch
 from torch import Tensor
 
 from gsim3d.cameras import Cameras, Frames
-from gsim3d.dynamics import last_steps
 from gsim3d.effects.plan import Plan
 from gsim3d.errors import NumericalError
 from gsim3d.numerics.report import StabilityReport
 from gsim3d.simulator import Simulator
-from gsim3d.state import Particles
+from gsim3d.state import Particles, last_steps
 from gsim3d.testing.invariances import (
     Check,
     Deviation,

@@ -26,7 +26,7 @@ from torch.nn.modules.conv import _ConvNd
 
 from gsim3d.cameras import Frames, TensorRecord
 from gsim3d.cuda_graphs import Captured, fit, fixed_geometry, of_prepared_state
-from gsim3d.dynamics import DynamicsConfig, concatenate
+from gsim3d.dynamics import DynamicsConfig
 from gsim3d.effects.plan import Plan
 from gsim3d.errors import CaptureError, InputError
 from gsim3d.io.checkpoint import laid_out_as
@@ -36,7 +36,7 @@ from gsim3d.numerics.report import StabilityReport
 from gsim3d.ops import PyramidCapacity
 from gsim3d.ops.curve import Pyramid
 from gsim3d.simulator import Simulator
-from gsim3d.state import ASLEEP, DYNAMIC, Particles
+from gsim3d.state import ASLEEP, DYNAMIC, Particles, concatenate
 from gsim3d.train.gradients import in_segments, recomputing
 from gsim3d.train.left_out import draw_left_out, images_per_cloud, with_views
 from gsim3d.train.samples import Batch, displaced

@@ -18,13 +18,12 @@ from torch import Tensor
 from torch.profiler import ProfilerActivity, profile, schedule
 
 from gsim3d.data import Scene, make_frames
-from gsim3d.dynamics import concatenate
 from gsim3d.effects.plan import Plan
 from gsim3d.errors import InputError
 from gsim3d.io.files import whole_file
 from gsim3d.io.plain import is_number
 from gsim3d.simulator import Simulator
-from gsim3d.state import Gaussians, Particles
+from gsim3d.state import Gaussians, Particles, concatenate
 from gsim3d.train.config import DataConfig, PhaseConfig
 from gsim3d.train.samples import context_cameras, spread_views, subsampled
 

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from gsim3d.cameras import Frames
 from gsim3d.data import Scene
-from gsim3d.dynamics import concatenate, last_steps
 from gsim3d.effects.edits import Duplicate, Edit, Move, Operation, Recolor, Remove, Throw, structure_of
 from gsim3d.effects.plan import Plan
 from gsim3d.effects.selection import Selection, newest_mask
@@ -20,7 +19,7 @@ from gsim3d.effects.spec import BACKGROUNDS, CHANGING, POLICIES, EffectsSpec, Ou
 from gsim3d.errors import InputError
 from gsim3d.numerics.speed import encode, encode_histories
 from gsim3d.numerics.trust import rollout_with_spread
-from gsim3d.state import DYNAMIC, Gaussians, Particles
+from gsim3d.state import DYNAMIC, Gaussians, Particles, concatenate, last_steps
 from gsim3d.train.restore import Restored
 from gsim3d.viewer.bodies import SOLID, with_bodies, with_copies
 from gsim3d.viewer.live import Target

@@ -5,8 +5,8 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.dynamics import Dynamics, DynamicsConfig, append_step, concatenate, last_steps, rollout
-from gsim3d.state import FROZEN
+from gsim3d.dynamics import Dynamics, DynamicsConfig, rollout
+from gsim3d.state import FROZEN, append_step, concatenate, last_steps
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, with_threads
 from tests.dynamics.scenes import EXPLICIT, SEEING, TINY, batch, float_fields, make_dynamics, make_history, permute_rows
 

@@ -5,8 +5,8 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.dynamics import append_step, concatenate, last_steps, rollout, with_attribute
-from gsim3d.state import DYNAMIC, FROZEN
+from gsim3d.dynamics import rollout
+from gsim3d.state import DYNAMIC, FROZEN, append_step, concatenate, last_steps, with_attribute
 from tests.asserts import assert_same_bits
 from tests.dynamics.scenes import EXPLICIT, SEEING, TINY, batch, float_fields, make_dynamics, make_history
 

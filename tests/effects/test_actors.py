@@ -5,14 +5,13 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.dynamics import last_steps
 from gsim3d.effects.actors import Actor, Actors
 from gsim3d.effects.edits import Edit, Move
 from gsim3d.effects.selection import Selection
 from gsim3d.effects.spec import DynamicsEffects, EffectsSpec, Sleep
 from gsim3d.errors import InputError
 from gsim3d.priors import InertiaConfig
-from gsim3d.state import DYNAMIC, FROZEN
+from gsim3d.state import DYNAMIC, FROZEN, last_steps
 from tests.asserts import assert_same_bits
 from tests.effects.models import MODELS
 from tests.test_simulator import CONFIG, awake, make_frames, make_simulator

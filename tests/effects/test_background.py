@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from gsim3d.cuda_graphs import CapturedRollout
-from gsim3d.dynamics import DynamicsConfig, Partition, RestLog, last_steps, rollout, rollout_in_parts
+from gsim3d.dynamics import DynamicsConfig, Partition, RestLog, rollout, rollout_in_parts
 from gsim3d.dynamics.frozen_context import FrozenContext
 from gsim3d.nn.point_transformer import SparseConv
 from gsim3d.ops import PatchTable, PyramidCapacity, curve_encode, joint_attention
 from gsim3d.ops.curve import CURVES
-from gsim3d.state import ASLEEP, FROZEN
+from gsim3d.state import ASLEEP, FROZEN, last_steps
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, assert_same_bits_for_any_threads
 from tests.dynamics.scenes import EXPLICIT, TINY, batch, float_fields, make_dynamics, make_history, permute_rows
 from tests.effects.resting import ASYMMETRIC, make_scenes, make_simulator, newest_rows

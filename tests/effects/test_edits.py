@@ -7,7 +7,7 @@ import pytest
 import torch
 import yaml
 
-from gsim3d.dynamics import RestLog, append_step, last_steps
+from gsim3d.dynamics import RestLog
 from gsim3d.effects.edits import (
     Duplicate,
     Edit,
@@ -23,7 +23,7 @@ from gsim3d.effects.edits import (
 from gsim3d.effects.spec import DynamicsEffects, EffectsSpec, Sleep, StructureEffects
 from gsim3d.errors import InputError
 from gsim3d.priors import InertiaConfig, ShapeMatchingConfig
-from gsim3d.state import DYNAMIC, FROZEN
+from gsim3d.state import DYNAMIC, FROZEN, append_step, last_steps
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.effects.models import MODELS
 from tests.priors.scenes import OCCLUSION

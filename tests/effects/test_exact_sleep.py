@@ -5,8 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.dynamics import last_steps
-from gsim3d.state import DYNAMIC
+from gsim3d.state import DYNAMIC, last_steps
 from tests.asserts import assert_same_bits
 from tests.dynamics.scenes import TINY, batch, make_history
 from tests.effects.resting import ASYMMETRIC, make_simulator

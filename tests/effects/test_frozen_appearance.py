@@ -7,12 +7,11 @@ import pytest
 import torch
 
 from gsim3d.cuda_graphs import CapturedRollout
-from gsim3d.dynamics import concatenate, last_steps
 from gsim3d.effects.edits import Duplicate, Edit, Insert, Move, Remove
 from gsim3d.effects.selection import Selection
 from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError
-from gsim3d.state import FROZEN
+from gsim3d.state import FROZEN, concatenate, last_steps
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.effects.models import MODELS, Case
 

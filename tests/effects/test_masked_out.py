@@ -3,9 +3,8 @@
 import pytest
 import torch
 
-from gsim3d.dynamics import last_steps
 from gsim3d.effects.spec import DynamicsEffects, EffectsSpec
-from gsim3d.state import DYNAMIC, FROZEN
+from gsim3d.state import DYNAMIC, FROZEN, last_steps
 from tests.asserts import assert_same_bits
 from tests.test_simulator import awake, make_frames, make_simulator
 

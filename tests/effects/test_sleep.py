@@ -5,10 +5,10 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.dynamics import RestLog, Sleepers, concatenate, last_steps, rollout_in_parts
+from gsim3d.dynamics import RestLog, Sleepers, rollout_in_parts
 from gsim3d.effects.spec import DynamicsEffects, EffectsSpec, Sleep
 from gsim3d.errors import InputError
-from gsim3d.state import ASLEEP, FROZEN, Particles
+from gsim3d.state import ASLEEP, FROZEN, Particles, concatenate, last_steps
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import TINY, batch, float_fields, make_history
 from tests.effects.resting import ASYMMETRIC, make_scenes, make_simulator

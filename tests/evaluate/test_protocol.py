@@ -12,7 +12,6 @@ import torch
 from gsim3d import presets
 from gsim3d.cameras import InputSpec
 from gsim3d.data import Scene
-from gsim3d.dynamics import concatenate
 from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError
 from gsim3d.evaluate import pictures, protocol
@@ -31,6 +30,7 @@ from gsim3d.evaluate.report import summarize, table, write_json
 from gsim3d.evaluate.scoring import SceneScores
 from gsim3d.io.checkpoint import Checkpoint
 from gsim3d.numerics.speed import Setting
+from gsim3d.state import concatenate
 from gsim3d.train.config import DataConfig
 from gsim3d.train.restore import Restored, build_simulator
 from tests.tiny_scenes import write_scene

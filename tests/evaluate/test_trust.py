@@ -10,7 +10,6 @@ import torch
 
 from gsim3d import presets
 from gsim3d.cli.main import main
-from gsim3d.dynamics import concatenate
 from gsim3d.errors import InputError, UnfamiliarInput
 from gsim3d.evaluate import trust as calibration
 from gsim3d.evaluate.protocol import default_views, input_frames, predict, predict_together
@@ -19,7 +18,7 @@ from gsim3d.io.settings import to_dict
 from gsim3d.numerics import trust
 from gsim3d.numerics.speed import encode_histories
 from gsim3d.numerics.trust import VARIANTS, Trust
-from gsim3d.state import DYNAMIC, last_steps
+from gsim3d.state import DYNAMIC, concatenate, last_steps
 from gsim3d.train.config import DataConfig
 from gsim3d.train.restore import build_simulator, restore
 from tests.tiny_scenes import write_scene

@@ -7,10 +7,10 @@ import torch
 from torch.nn import functional as F
 
 from gsim3d.compat.released_model import ReleasedDynamicsConfig, as_released
-from gsim3d.dynamics import Dynamics, last_steps, rollout
+from gsim3d.dynamics import Dynamics, rollout
 from gsim3d.dynamics.step import StateLayout
 from gsim3d.math.spherical_harmonics import degree_damping
-from gsim3d.state import FROZEN
+from gsim3d.state import FROZEN, last_steps
 from tests.asserts import relative_to_max
 from tests.golden.published import NOT_IN_GOLDEN, close, dynamics_config, particles_of, renamed
 from tests.golden_files import golden

@@ -5,10 +5,10 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.dynamics import last_steps, rollout
+from gsim3d.dynamics import rollout
 from gsim3d.errors import InputError
 from gsim3d.priors import GravityConfig, InertiaConfig, ProximityConfig, ShapeMatchingConfig
-from gsim3d.state import DYNAMIC, FROZEN
+from gsim3d.state import DYNAMIC, FROZEN, last_steps
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import TINY, batch, make_dynamics, make_history
 from tests.priors.scenes import build, context, with_priors, without_prior

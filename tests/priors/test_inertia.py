@@ -5,12 +5,12 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.dynamics import last_steps, rollout, with_attribute
+from gsim3d.dynamics import rollout
 from gsim3d.effects.edits import Rotate, Throw
 from gsim3d.math.rotations import rotation_matrices
 from gsim3d.priors import InertiaConfig
 from gsim3d.priors.inertia import rotate_with_window
-from gsim3d.state import DYNAMIC, FROZEN
+from gsim3d.state import DYNAMIC, FROZEN, last_steps, with_attribute
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import TINY, batch, make_dynamics, make_history
 from tests.priors.scenes import build, context, windows, with_priors

@@ -7,11 +7,11 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from gsim3d.dynamics import last_steps, rollout
+from gsim3d.dynamics import rollout
 from gsim3d.priors import padding
 from gsim3d.priors.lighting import SOFT, lambert
 from gsim3d.priors.movable import Movable
-from gsim3d.state import ASLEEP, DYNAMIC, FROZEN
+from gsim3d.state import ASLEEP, DYNAMIC, FROZEN, last_steps
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import TINY, batch, make_dynamics, make_history, permute_rows
 from tests.priors.scenes import with_priors

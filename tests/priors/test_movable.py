@@ -5,10 +5,9 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.dynamics import with_attribute
 from gsim3d.priors import DirectionalLightConfig, GravityConfig, InertiaConfig, ShapeMatchingConfig
 from gsim3d.priors.movable import Movable
-from gsim3d.state import DYNAMIC
+from gsim3d.state import DYNAMIC, with_attribute
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import SEEING, TINY, batch, float_fields, make_dynamics, make_history
 from tests.priors.scenes import with_priors

@@ -7,13 +7,13 @@ from functools import partial
 import pytest
 import torch
 
-from gsim3d.dynamics import last_steps, rollout
+from gsim3d.dynamics import rollout
 from gsim3d.errors import InputError
 from gsim3d.priors import DirectionalLightConfig
 from gsim3d.priors.lighting import optical_depth
 from gsim3d.priors.movable import Movable
 from gsim3d.priors.padding import SAMPLES
-from gsim3d.state import ASLEEP, DYNAMIC, FROZEN
+from gsim3d.state import ASLEEP, DYNAMIC, FROZEN, last_steps
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import TINY, batch, make_dynamics, make_history, permute_rows
 from tests.priors.scenes import with_priors

@@ -5,10 +5,9 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.dynamics import last_steps
 from gsim3d.priors import InertiaConfig, PositionWavesConfig, ProximityConfig
 from gsim3d.priors.position_waves import position_waves
-from gsim3d.state import ASLEEP, DYNAMIC, FROZEN
+from gsim3d.state import ASLEEP, DYNAMIC, FROZEN, last_steps
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import TINY, batch, make_dynamics, make_history, permute_rows
 from tests.priors.scenes import build, context, with_priors

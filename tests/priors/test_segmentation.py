@@ -5,11 +5,10 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.dynamics import with_attribute
 from gsim3d.effects.edits import Duplicate, Move
 from gsim3d.priors import SegmentationConfig
 from gsim3d.priors.padding import SAMPLES
-from gsim3d.state import DYNAMIC, FROZEN
+from gsim3d.state import DYNAMIC, FROZEN, with_attribute
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import batch, make_dynamics, make_history
 from tests.priors.scenes import context, windows, with_priors

@@ -6,11 +6,11 @@ import math
 import pytest
 import torch
 
-from gsim3d.dynamics import last_steps, rollout
+from gsim3d.dynamics import rollout
 from gsim3d.effects.edits import Move, Rotate
 from gsim3d.priors import InertiaConfig, ShapeMatchingConfig
 from gsim3d.priors.rigid import best_rotation
-from gsim3d.state import FROZEN
+from gsim3d.state import FROZEN, last_steps
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import TINY, batch, make_dynamics, make_history
 from tests.priors.scenes import build, context, with_priors

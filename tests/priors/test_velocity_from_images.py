@@ -6,10 +6,9 @@ import pytest
 import torch
 
 from gsim3d.cameras import Cameras, Frames
-from gsim3d.dynamics import last_steps
 from gsim3d.priors import VelocityFromImagesConfig
 from gsim3d.priors.velocity_from_images import estimate_velocity
-from gsim3d.state import DYNAMIC, FROZEN
+from gsim3d.state import DYNAMIC, FROZEN, last_steps
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import batch, make_history
 from tests.priors.scenes import context

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from gsim3d import presets
-from gsim3d.dynamics import last_steps
 from gsim3d.simulator import Simulator
+from gsim3d.state import last_steps
 from gsim3d.testing.invariances import Sample
 from gsim3d.testing.stress import STRESS_TESTS, gradient_norms, rollout_curves
 from gsim3d.train.loop import deterministic

@@ -10,12 +10,11 @@ import torch
 
 from gsim3d import presets
 from gsim3d.cameras import Cameras
-from gsim3d.dynamics import last_steps
 from gsim3d.errors import InputError, NumericalError
 from gsim3d.numerics.policy import StabilityConfig
 from gsim3d.numerics.report import Finding, Reading, StabilityReport, Statistics, _Record, pack
 from gsim3d.ops import rasterize_gaussians
-from gsim3d.state import ASLEEP
+from gsim3d.state import ASLEEP, last_steps
 from tests.asserts import assert_same_bits
 from tests.test_simulator import CONFIG, awake, make_frames, make_simulator, target_cameras
 

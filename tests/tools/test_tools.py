@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from gsim3d import presets
-from gsim3d.dynamics import last_steps
 from gsim3d.simulator import Simulator
+from gsim3d.state import last_steps
 
 ROOT = Path(__file__).parents[2]
 

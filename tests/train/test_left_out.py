@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from gsim3d.data import Scene
-from gsim3d.dynamics import concatenate
 from gsim3d.errors import InputError
+from gsim3d.state import concatenate
 from gsim3d.train.captured import CapturedLoss
 from gsim3d.train.config import DataConfig, LossConfig, PhaseConfig, TrainConfig
 from gsim3d.train.left_out import draw_left_out, images_per_cloud, with_views

@@ -14,11 +14,11 @@ import torch
 from safetensors.torch import save_file
 
 from gsim3d.data import Scene, find_scenes
-from gsim3d.dynamics import concatenate
 from gsim3d.errors import InputError, NumericalError
 from gsim3d.evaluate.perceptual.lpips import LPIPS
 from gsim3d.evaluate.perceptual.weights import SOURCES, cache_folder
 from gsim3d.io import checkpoint
+from gsim3d.state import concatenate
 from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, PhaseConfig, TrainConfig
 from gsim3d.train.loop import Trainer, deterministic
 from gsim3d.train.losses import image_loss, time_weights

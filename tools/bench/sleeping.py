@@ -19,9 +19,9 @@ from harness import Bench
 from gsim3d import presets
 from gsim3d.cameras import Cameras
 from gsim3d.cuda_graphs import CapturedRollout
-from gsim3d.dynamics import Partition, RestLog, append_step, last_steps
+from gsim3d.dynamics import Partition, RestLog
 from gsim3d.simulator import Simulator
-from gsim3d.state import DYNAMIC, FROZEN, Particles
+from gsim3d.state import DYNAMIC, FROZEN, Particles, append_step, last_steps
 
 SHARES = (0.5, 0.9, 0.99)
 SIZE = 128

@@ -21,12 +21,12 @@ import torch
 ROOT = Path(__file__).resolve().parent.parent.parent
 sys.path.insert(0, str(ROOT))
 from gsim3d.data import Scene, find_scenes  # noqa: E402
-from gsim3d.dynamics import last_steps  # noqa: E402
 from gsim3d.errors import InputError  # noqa: E402
 from gsim3d.evaluate.protocol import default_views, horizon, input_frames  # noqa: E402
 from gsim3d.io.files import opencv_path, write_whole  # noqa: E402
 from gsim3d.io.terminal import progress  # noqa: E402
 from gsim3d.nn.multiview_encoder import pixel_rows  # noqa: E402
+from gsim3d.state import last_steps  # noqa: E402
 from gsim3d.synth.render import FIRST_BODY  # noqa: E402
 from gsim3d.synth.writer import FILE_TEMPLATE  # noqa: E402
 from gsim3d.train.restore import Restored, restore  # noqa: E402
