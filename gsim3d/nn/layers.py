@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
+from torch.autograd import forward_ad
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
@@ -23,7 +24,8 @@ MIN_ROWS = 16  # matrix products of fewer rows go through other code in BLAS, wh
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None, *, gelu: bool = False) -> Tensor:
     """``F.linear``, or ``F.gelu`` of it; in float32 on the CPU by oneDNN, which is faster than BLAS on some."""
     one_dnn = x.is_cpu and x.dtype == weight.dtype == torch.float32 and torch.backends.mkldnn.is_available()
-    if not one_dnn or torch.is_autocast_enabled("cpu") or torch.compiler.is_compiling():
+    traced = torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active()
+    if not one_dnn or traced or torch.is_autocast_enabled("cpu") or forward_ad._current_level >= 0:
         out = F.linear(x, weight, bias)
     elif torch.is_grad_enabled():
         out = _OneDnnLinear.apply(x, weight, bias)

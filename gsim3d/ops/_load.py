@@ -18,8 +18,9 @@ except ImportError as error:
 os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
 # glibc would give the memory of large tensors back to the kernel, which clears the pages of each new one: up to a third
-# of the time on the CPU. Up to 2 GiB of freed memory stay with the process.
-if mallopt := getattr(ctypes.CDLL(None), "mallopt", None) if os.name == "posix" else None:
+# of the time on the CPU. Up to 2 GiB of freed memory stay with the process; settings of its environment come first.
+_chosen = {"MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_", "GLIBC_TUNABLES"} & set(os.environ)
+if mallopt := getattr(ctypes.CDLL(None), "mallopt", None) if os.name == "posix" and not _chosen else None:
     mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD
     mallopt(-3, 2**30)  # M_MMAP_THRESHOLD
 

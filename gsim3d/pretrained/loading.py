@@ -141,9 +141,9 @@ class _WithoutFirstWeights(TorchFunctionMode):
     """Mode that skips values of meta tensors, for which torch would import its compiler."""
 
     def __torch_function__(self, function, types, args=(), kwargs=None):
-        if function.__name__.endswith(("normal_", "uniform_", "div", "mul", "normalize")):
-            return args[0] if args else kwargs["tensor"]
-        return function(*args, **(kwargs or {}))
+        first = args[0] if args else (kwargs or {}).get("tensor")
+        skipped = function.__name__.endswith(("normal_", "uniform_", "div", "mul", "normalize"))
+        return first if skipped and getattr(first, "is_meta", False) else function(*args, **(kwargs or {}))
 
 
 def first_weights(simulator: nn.Module, effects: EffectsSpec, weights: dict[str, Tensor]) -> dict[str, Tensor]:

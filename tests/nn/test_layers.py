@@ -250,3 +250,13 @@ def test_some_outputs_follow_the_weights():
     used = torch.zeros(9, dtype=torch.bool)
     used[columns] = True
     assert torch.equal(layer.weight.grad.any(1), used) and torch.equal(layer.bias.grad > 0, used)
+
+
+def test_transforms_of_linear_layers():
+    layer, x = RowLinear(8, 4), torch.randn(20, 8, generator=torch.Generator().manual_seed(0))
+    expected = torch.autograd.grad(layer(x).square().sum(), layer.weight)[0]
+    loss = lambda weight: torch.func.functional_call(layer, {"weight": weight}, (x,)).square().sum()  # noqa: E731
+    assert_close_relative_to_max(torch.func.grad(loss)(layer.weight.detach()), expected, 1e-5)
+    along = torch.ones_like(expected)
+    _, tangent = torch.func.jvp(loss, (layer.weight.detach(),), (along,))
+    assert_close_relative_to_max(tangent, (expected * along).sum(), 1e-5)
