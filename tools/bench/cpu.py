@@ -9,6 +9,7 @@ part of the median. With SCENE, a scene folder, the commands of this commit are 
 """
 
 import argparse
+import dataclasses
 import json
 import os
 import subprocess
@@ -18,8 +19,8 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-# case -> (what, wanted ratio to the other commit)
-CASES = {
+CASES = {  # case -> (what, wanted ratio to the other commit)
+    "pure": ("a step of the pure elastic model, one scene, 8,164 particles", None),
     "step": ("a step of `small`, one scene of 4 steps", None),
     "encode": ("encode of `small`, 4 views x 4 steps", 2.0),
     "train": ("training step of `tiny`", 1.3),
@@ -39,16 +40,18 @@ def serve() -> None:
     from gsim3d.presets import small, tiny
     from gsim3d.simulator import Simulator
 
-    torch.set_num_threads(2)
-    views = [surface_scene.evenly(4)] * 4
-    frames, places = surface_scene.frames(1, views, 128, masked=True)
-    models = {}
-    for name, preset in (("small", small), ("tiny", tiny)):
+    def model(config, n_views, size):
+        frames, places = surface_scene.frames(1, [surface_scene.evenly(n_views)] * 4, size, masked=True)
         torch.manual_seed(0)
-        models[name] = surface_scene.as_if_trained(Simulator(preset()), places.float())
-    small, tiny = models["small"].eval(), models["tiny"].train()
-    with torch.no_grad():
-        state = small.encode(frames)
+        made = surface_scene.as_if_trained(Simulator(config), places.float()).eval()
+        return made, frames, torch.no_grad()(made.encode)(frames)
+
+    torch.set_num_threads(2)
+    config = small()
+    dynamics = dataclasses.replace(config.dynamics, position_features=False)  # as in configs/train/elastic.yaml
+    pure, _, few = model(dataclasses.replace(config, dynamics=dynamics), 2, 64)
+    (small, frames, state), (tiny, *_) = model(config, 4, 128), model(tiny(), 4, 128)
+    tiny.train()
 
     def train() -> None:
         particles = tiny.encode(frames)
@@ -56,8 +59,8 @@ def serve() -> None:
         image.color.square().mean().backward()
 
     runs = {"encode": lambda: small.encode(frames), "step": lambda: small.rollout(state, 1), "train": train}
-    for line in sys.stdin:
-        case = line.strip()
+    runs["pure"] = lambda: pure.rollout(few, 1)
+    for case in map(str.strip, sys.stdin):
         start = time.perf_counter(), time.process_time()
         with torch.set_grad_enabled(case == "train"):
             runs[case]()
