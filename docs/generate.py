@@ -53,14 +53,12 @@ def table(head: tuple[str, ...], rows) -> str:
 
 def commands() -> str:
     """The help of every command."""
-    from gsim3d.cli.arguments import Parser
-    from gsim3d.cli.main import COMMANDS
+    from gsim3d.cli.main import COMMANDS, command
 
     parts = []
-    for name, (module, summary) in COMMANDS.items():
-        parser = Parser(prog=f"gsim3d {name}")
+    for name, (_, summary) in COMMANDS.items():
+        _, parser = command(name)
         parser.formatter_class = lambda prog: argparse.RawDescriptionHelpFormatter(prog, width=100)
-        importlib.import_module(module).add_arguments(parser)
         parts.append(
             f"## {name}\n\n{summary[0].upper()}{summary[1:]}.\n\n```text\n{parser.format_help().strip()}\n```\n"
         )

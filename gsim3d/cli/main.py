@@ -6,13 +6,13 @@ import importlib
 import sys
 import warnings
 from functools import partial
+from typing import Any
 
 from gsim3d.cli.arguments import Parser
 from gsim3d.errors import CaptureError, FitWarning, InputError, NumericalError, RunStopped, did_you_mean
 from gsim3d.io.terminal import Terminal
 
-# command -> (module with add_arguments(parser) and run(args), what it does); modules load when they are called, and
-# their docstrings are the descriptions and epilogs of --help
+# command -> (module with add_arguments(parser) and run(args), what it does); modules load when they are called
 COMMANDS = {
     "generate": ("gsim3d.cli.generate", "make a data set: multi-view video of simulated bodies that fall"),
     "bound": ("gsim3d.cli.bound", "the scores that a perfect simulator has on a generated data set"),
@@ -47,6 +47,15 @@ def main(arguments: list[str] | None = None) -> int:
             sys.stdout.flush()
 
 
+def command(name: str) -> tuple[Any, Parser]:
+    """The module of a command, and its parser, which shows the module's docstring with --help."""
+    module = importlib.import_module(COMMANDS[name][0])
+    about, _, epilog = (module.__doc__ or "").partition("\n\n")
+    parser = Parser(prog=f"gsim3d {name}", description=about, epilog=epilog)
+    module.add_arguments(parser)
+    return module, parser
+
+
 def _command(arguments: list[str]) -> int:
     name = arguments[0] if arguments else None
     args = argparse.Namespace()
@@ -56,10 +65,7 @@ def _command(arguments: list[str]) -> int:
         with warnings.catch_warnings():
             warnings.simplefilter("default", FitWarning)
             warnings.showwarning = partial(_show_warning, warnings.showwarning)
-            module = importlib.import_module(COMMANDS[name][0])
-            about, _, epilog = (module.__doc__ or "").partition("\n\n")
-            parser = Parser(prog=f"gsim3d {name}", description=about, epilog=epilog)
-            module.add_arguments(parser)
+            module, parser = command(name)
             args = parser.parsed(arguments[1:])
             return module.run(args) or 0
     except (InputError, NumericalError, CaptureError) as error:
