@@ -80,12 +80,13 @@ def propose(takes: Sequence[Scene], device: str, say: Callable[[str], None]) -> 
     around = _depths(takes) if has_masks else None
     depths, why = (around, "around the moving bodies") if around else ((first.near, first.far), "of the cameras")
     say(f"  depth: {depths[0]:.2f} to {depths[1]:.2f} m, {why}")
-    held_out = _held_out_camera(first) if first.n_cams > 3 else None
-    if held_out is None:
-        why = f"there are only {first.n_cams}; each is drawn from the particles of the others"
-        say(f"  held out: no camera, because {why}")
-    else:
+    if first.n_cams > 3:
+        nearest = np.sort(angles(first.recording.viewmats[0]), axis=1)[:, 1:3]
+        held_out = int(np.argmin(nearest.sum(1)))
         say(f"  held out: camera {first.camera_names[held_out]}, which the others surround best")
+    else:
+        held_out, why = None, f"there are only {first.n_cams}; each is drawn from the particles of the others"
+        say(f"  held out: no camera, because {why}")
     return Proposal(first.fps, size, tuple(crops), depths, stride, held_out)
 
 
@@ -145,12 +146,6 @@ def _depths(takes: Sequence[Scene]) -> tuple[float, float] | None:
         return None
     near, far = (float(np.quantile([d[end] for d in depths], q)) for end, q in ((0, 1 - MOST), (1, MOST)))
     return (DEPTH_MARGINS[0] * near, DEPTH_MARGINS[1] * far) if near > 0 else None
-
-
-def _held_out_camera(scene: Scene) -> int:
-    """Returns the camera with the smallest sum of angles to its two nearest neighbours."""
-    found = np.sort(angles(scene.recording.viewmats[0]), axis=1)
-    return int(np.argmin(found[:, 1] + found[:, 2]))
 
 
 def write_scene(take: Scene, proposal: Proposal, steps: Sequence[int], folder: Path) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import importlib.metadata
 import platform
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,6 +28,14 @@ def machine(device: torch.device) -> dict[str, str]:
     if device.type == "cuda":
         return found | {"device": torch.cuda.get_device_name(device), "cuda": str(torch.version.cuda)}
     return found | {"device": f"CPU, {torch.get_num_threads()} threads", "processor": processor_name()}
+
+
+def version_of(distribution: str) -> str | None:
+    """Version of an installed distribution, or None."""
+    try:
+        return importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:
+        return None
 
 
 def processor_name() -> str:

@@ -12,7 +12,6 @@ import platform
 import shutil
 from collections import Counter
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import cv2
@@ -20,7 +19,7 @@ import numpy as np
 
 from gsim3d.errors import InputError, naming
 from gsim3d.io.files import write_whole
-from gsim3d.io.machine import processor_name
+from gsim3d.io.machine import processor_name, version_of
 from gsim3d.io.plain import parse_json
 from gsim3d.synth.cameras import Rig, workspace_origin
 from gsim3d.synth.render import View
@@ -154,7 +153,7 @@ def write_manifest(out: Path, folders: list[Path], settings: dict) -> dict:
         "generator_version": GENERATOR_VERSION,
         "settings": settings,
         "machine": {"processor": processor_name(), "system": platform.platform(), "python": platform.python_version()},
-        "versions": {package: _version(package) for package in PACKAGES},
+        "versions": {package: version_of(package) or "absent" for package in PACKAGES},
         "rejected": rejected_draws(folders),
         "scenes": scenes,
     }
@@ -165,10 +164,3 @@ def write_manifest(out: Path, folders: list[Path], settings: dict) -> dict:
 def rejected_draws(folders: list[Path]) -> dict[str, int]:
     """Reason -> number of rejected draws."""
     return dict(Counter(reason for folder in folders for reason in read_metadata(folder)["rejected"]))
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "absent"

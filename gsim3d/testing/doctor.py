@@ -1,10 +1,11 @@
 """Checks of the installation and self-tests of all ops (``gsim3d doctor``). Works without torch."""
 
 import importlib
-import importlib.metadata
 import platform
 import sys
 import time
+
+from gsim3d.io.machine import version_of
 
 # distribution -> (import name, purpose, install command)
 OPTIONAL = {
@@ -23,13 +24,6 @@ def check_installation() -> bool:
     return versions and compiled
 
 
-def _version(distribution: str) -> str | None:
-    try:
-        return importlib.metadata.version(distribution)
-    except importlib.metadata.PackageNotFoundError:
-        return None
-
-
 def _row(mark: str, name: str, text: str) -> None:
     print(f"  {mark:<4} {name:<32} {text}")
 
@@ -43,14 +37,14 @@ def _versions() -> bool:
     _row("ok" if in_range else "warn", "python", f"{platform.python_version()} ({platform.platform()})")
     healthy = True
     for name in REQUIRED:
-        version = _version(name)
+        version = version_of(name)
         if version is None and name.startswith("opencv"):  # any OpenCV wheel will do
-            version = next(filter(None, map(_version, ("opencv-python", "opencv-python-headless"))), None)
+            version = next(filter(None, map(version_of, ("opencv-python", "opencv-python-headless"))), None)
         healthy &= version is not None
         _row("ok" if version else "FAIL", name, version or f"missing: pip install {name}")
     print("Optional parts")
     for name, (module, purpose, command) in OPTIONAL.items():
-        version = _version(name)
+        version = version_of(name)
         if version is None:
             _row("-", name, f"not installed ({purpose}): {command}")
             continue

@@ -292,9 +292,12 @@ class _Step:
         owner, dynamics, of_calls, n_calls = self._owner, self._owner.simulator.dynamics, [], itertools.count(1)
         geometry = _OfCalls(geometry)
 
+        def aliases_of(weights: Sequence[Tensor]) -> list[Tensor]:  # whose gradients few multi-tensor kernels add
+            return [weight.detach().requires_grad_() for weight in weights]
+
         def with_own_weights(predict: Callable[[Particles], Particles]) -> Callable[[Particles], Particles]:
             def call(state: Particles) -> Particles:
-                with _replaced(dynamics.modules(), _aliases) as aliases:
+                with _replaced(dynamics.modules(), aliases_of) as aliases:
                     of_calls.append(aliases)
                     return owner.again("steps")(geometry.in_call(next(n_calls), predict))(state)
 
@@ -453,12 +456,6 @@ def _replaced(modules: Iterable[nn.Module], make: Callable[[list[Tensor]], Seque
     finally:
         for part, name, value in owners:
             part._parameters[name] = value
-
-
-def _aliases(values: Sequence[Tensor]) -> list[Tensor]:
-    """The same memory. Gradients of aliases are added by a few multi-tensor kernels instead of thousands, call by
-    call."""
-    return [value.detach().requires_grad_() for value in values]
 
 
 def _rounded(encoder: Encoder) -> AbstractContextManager:

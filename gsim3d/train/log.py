@@ -254,14 +254,11 @@ def read_entry(line: bytes) -> dict[str, Any] | None:
     return entry if isinstance(entry, dict) and is_number(entry.get("step"), int) else None
 
 
-def check_profile(n_steps: int) -> None:
-    """Raises InputError if too few steps are left to trace."""
+def profiler(out: Path, rank: int, n_steps: int) -> profile:
+    """Returns a profiler that writes ``out/profile/process_<rank>.json`` after its traced steps. Raises InputError if
+    ``n_steps``, those of the run, are too few."""
     if n_steps < SKIPPED + WARM_UP + TRACED:
         raise InputError(f"--profile traces steps 3 and 4 of a run; this one has {n_steps}")
-
-
-def profiler(out: Path, rank: int) -> profile:
-    """Returns a profiler that writes ``out/profile/process_<rank>.json`` after its traced steps."""
     folder = out / TRACES
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / f"process_{rank}.json"

@@ -41,7 +41,6 @@ from gsim3d.train.left_out import draw_left_out, images_per_cloud, with_views
 from gsim3d.train.log import (
     Log,
     Sample,
-    check_profile,
     draw_sample,
     memory_gib,
     plain,
@@ -176,9 +175,7 @@ class Trainer:
         self.processes.check_same(weights=self.parameters.values())
         shows = progress and self.processes.is_first
         bar = tqdm(total=until, initial=self.step, desc="training", unit="step", disable=None if shows else True)
-        if profile:
-            check_profile(until - self.step)
-        tracer = profiler(self.out, self.processes.rank) if profile else nullcontext()
+        tracer = profiler(self.out, self.processes.rank, until - self.step) if profile else nullcontext()
         lock = only_one_writer(self.out) if self.processes.is_first else nullcontext()
         config = describe(self.config, self.simulator.config, self.scenes[0], self.effects) if wandb else None
         log, signals = self.log.opened(tensorboard=tensorboard, wandb=config), noted_signals()
