@@ -28,7 +28,8 @@ ENGINES = {"mujoco": "gsim3d.synth.mujoco_engine", "genesis": "gsim3d.synth.gene
 CLOTH_REFINEMENT = 3  # resolution of the rendered cloth over the simulated one
 TRAIN = "train"
 CLOTH_COLOR = (0.78, 0.14, 0.12)  # of worlds with ``by_name``
-LATER_OPTIONS = ("by_name", "ground_albedo")  # not in fingerprints at their defaults, so that older sets stay valid
+# Not in fingerprints at their defaults, so that older sets stay valid.
+LATER_OPTIONS = ("by_name", "camera_spread", "ground_albedo")
 MAX_SPREAD = 0.25  # largest camera_spread; bodies would leave the view of closer cameras
 HIGHER, STEEPER = 0.5, 45.0  # spread of the target height (in distances) and of the elevation (in degrees)
 RIM_POINTS = 64  # points of the ground's rim whose depths are checked
@@ -174,9 +175,7 @@ class World(ABC):
         """Hash of all options that the scenes of object ``name`` depend on."""
         fields = dataclasses.asdict(self)
         others = self.n_bodies[1] > 1  # scenes then have random other objects
-        unused = (
-            ["n_trajectories", "meshes"] + ["objects"] * (not others) + ["camera_spread"] * (not self.camera_spread)
-        )
+        unused = ["n_trajectories", "meshes"] + ["objects"] * (not others)
         unused += [field for field in LATER_OPTIONS if fields[field] == getattr(World, field)]
         fields = {field: value for field, value in fields.items() if field not in unused}
         text = json.dumps([writer.GENERATOR_VERSION, self.name, fields, name], sort_keys=True)

@@ -20,8 +20,7 @@ REQUIRED = ["torch", "numpy", "opencv-contrib-python-headless", "pyyaml", "safet
 
 def check_installation() -> bool:
     """Prints a line for every package, compiled module and op. Returns whether all required ones work."""
-    versions, compiled = _versions(), _compiled()
-    return versions and compiled
+    return all([_versions(), _compiled()])
 
 
 def _row(mark: str, name: str, text: str) -> None:

@@ -82,17 +82,14 @@ class StepWatch:
     Attributes:
         report: StabilityReport of the call.
         strict: treat dropped particles as errors.
+        n_particles, n_clouds: numbers of encoded particles and clouds.
     """
 
     def __init__(self, *, strict: bool = False):
         self.strict = strict
         self.report = StabilityReport()
-        self._n_particles = self._n_clouds = 0
+        self.n_particles = self.n_clouds = 0
         self._squares: list[list[Tensor]] = []
-
-    def count(self, n_particles: int, n_clouds: int) -> None:
-        """Records the number of encoded particles and clouds."""
-        self._n_particles, self._n_clouds = n_particles, n_clouds
 
     def seen(self, scale: float | None) -> Seen:
         """Returns the statistics after the backward pass; without gradient norms where ``scale``, the factor of the
@@ -100,7 +97,7 @@ class StepWatch:
         wrong = ("error", "dropped") if self.strict else ("error",)
         error = next((str(finding.error()) for finding in self.report.findings if finding.action in wrong), None)
         norms = () if scale is None else tuple(norm / scale for norm in self.norms())
-        return Seen(self._n_particles, self._n_clouds, self.report.total, norms, error)
+        return Seen(self.n_particles, self.n_clouds, self.report.total, norms, error)
 
     def follow(self, steps: Sequence[Particles]) -> None:
         """Registers hooks that record the gradients of each step of a rollout."""

@@ -322,7 +322,7 @@ class Trainer:
         watch, factor = watch or StepWatch(), factor * self.scale.value
         if self.captured is not None:
             prepared = self._prepared(samples)
-            watch.count(sum(prepared.counts), len(prepared.counts))
+            watch.n_particles, watch.n_clouds = sum(prepared.counts), len(prepared.counts)
             found = self.captured(prepared, self.step_weights(prepared.batch) * factor, watch.report)
             return found.loss / factor, found.errors, found.parameters, watch
         loss, errors = self.loss(self._batch(samples), samples[0], watch)
@@ -404,7 +404,7 @@ class Trainer:
             particles = again("encoder")(lambda context: simulator.encode(context, **options))(batch.context)
         if self.config.data.leave_one_out:
             particles = with_views(particles, batch.context)
-        watch.count(particles.n_rows, particles.n_clouds)
+        watch.n_particles, watch.n_clouds = particles.n_rows, particles.n_clouds
         if batch.n_future:
             if self.config.data.unfrozen_background:
                 rng = generator(self.config.seed, self.step, sample, "thawed")  # name of older versions, kept for bits

@@ -187,7 +187,7 @@ class Viewer:
             speed = gui.add_slider("Speed", *SPEEDS, 0.1, 1.0)
             loop = gui.add_checkbox("Loop", True)
             self._status = gui.add_markdown("")
-        self.on(self._play, self._toggle, "on_click")
+        self.on(self._play, lambda: (self._pause if self.timeline.playing else self.timeline.play)(), "on_click")
         self.on(self._frame, lambda: self._seek(int(self._frame.value)))
         self.on(speed, lambda: self.timeline.set_speed(speed.value))
         self.on(loop, lambda: setattr(self.timeline, "loop", loop.value))
@@ -257,9 +257,6 @@ class Viewer:
         register = getattr(handle, event)
         (register() if handle is self.server.scene else register)(call)
 
-    def _toggle(self) -> None:
-        (self._pause if self.timeline.playing else self.timeline.play)()
-
     def _pause(self) -> None:
         self.timeline.pause()
         self._play.label = "Play"
@@ -292,8 +289,11 @@ class Viewer:
             frame = self.timeline.frame
             seen = self._target.seen(frame, self.layers)
             with self.server.atomic():
-                if seen is not None:
-                    self._draw_splats(*splatting_of(seen, self._unit))
+                splats = () if seen is None else splatting_of(seen, self._unit)
+                if splats and self._splats is None:
+                    self._splats = self.server.scene.add_gaussian_splats("/gaussians", *splats, scale=self._unit)
+                elif splats:
+                    self._splats.set_gaussians(*splats)
                 self._draw_cameras(frame)
                 if self._beside is not None:
                     self._beside.visible = self.layers.truth
@@ -314,12 +314,6 @@ class Viewer:
         if self._simulation is not None:
             text += f", {1000 * self._simulation.seconds_a_step:.0f} ms a simulated step"
         return f"{text}, **at work ({self._n_working} to do)**" if self._n_working else text
-
-    def _draw_splats(self, *arrays: np.ndarray) -> None:
-        if self._splats is None:
-            self._splats = self.server.scene.add_gaussian_splats("/gaussians", *arrays, scale=self._unit)
-        else:
-            self._splats.set_gaussians(*arrays)
 
     def _draw_cameras(self, frame: int) -> None:
         if not self._cams:
