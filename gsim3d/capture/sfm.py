@@ -56,15 +56,9 @@ def calibrate_sfm(films: Sequence[Film]) -> list[Calibrated]:
             "their images share too few features; move the cameras closer together, add texture to the scene, or film "
             "a board (--board)"
         )
-    viewmats = np.stack([_viewmat(registered[film.name]) for film in films])
-    viewmats = _upright(viewmats)
+    poses = (registered[film.name].cam_from_world().matrix() for film in films)
+    viewmats = _upright(np.stack([np.vstack([pose, [0, 0, 0, 1]]) for pose in poses]))
     return [_camera(film, found, registered[film.name], pose) for film, pose in zip(films, viewmats, strict=True)]
-
-
-def _viewmat(image) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3] = image.cam_from_world().matrix()
-    return pose
 
 
 def _camera(film: Film, model, image, viewmat: np.ndarray) -> Calibrated:
