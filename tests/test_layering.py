@@ -37,9 +37,10 @@ RINGS = {
         simulator
     """,
     "workshop": """
+        compat
         data evaluate.perceptual planning
         evaluate.metrics
-        baselines compat
+        baselines
         train
         viewer
         synth

@@ -7,9 +7,10 @@ from pathlib import Path
 import torch
 
 from gsim3d.data import Scene, make_frames
-from gsim3d.effects.plan import Plan, Workload, background_cost, predicted_cost
+from gsim3d.effects.plan import Plan
 from gsim3d.effects.spec import EffectsSpec, OutputEffects
 from gsim3d.errors import InputError
+from gsim3d.evaluate.plan_costs import Workload, background_cost, predicted_cost
 from gsim3d.io.settings import from_dict
 from gsim3d.io.terminal import in_columns
 from gsim3d.numerics.speed import SPEEDS_FILE, read_checkpoints
@@ -28,9 +29,9 @@ class PartTimes:
 
     on: str  #: name of the machine
     work: Workload  #: workload at which the times were measured
-    dynamics: float = 0.0  #: milliseconds of the parts of :func:`gsim3d.effects.plan.predicted_cost`
-    gaussians: float = 0.0  #: milliseconds of the parts of :func:`gsim3d.effects.plan.predicted_cost`
-    images: float = 0.0  #: milliseconds of the parts of :func:`gsim3d.effects.plan.predicted_cost`
+    dynamics: float = 0.0  #: milliseconds of the parts of :func:`gsim3d.evaluate.plan_costs.predicted_cost`
+    gaussians: float = 0.0  #: milliseconds of the parts of :func:`gsim3d.evaluate.plan_costs.predicted_cost`
+    images: float = 0.0  #: milliseconds of the parts of :func:`gsim3d.evaluate.plan_costs.predicted_cost`
     host: float = 0.0  #: milliseconds in which a GPU waits for the host
 
     def __post_init__(self):

@@ -78,23 +78,20 @@ def call(op: str, *arguments: Any) -> Any:
     overload = getattr(torch.ops.gsim3d, op).default
     if torch.compiler.is_compiling():
         return overload(*arguments)
+    device = next(x for x in arguments if isinstance(x, Tensor)).device.type
+    casts = device != "meta" and torch.is_autocast_enabled(device)
     if torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0:
         if op not in _functions:
             return overload(*arguments)
         function, without = _functions[op]
         refuse(op, {name: arguments[k] for name, k in without.items()})
-        if op in _casts and (device := arguments[0].device.type) != "meta" and torch.is_autocast_enabled(device):
+        if op in _casts and casts:
             arguments = tuple(_casts[op](device, arguments))  # rules of gradients see what is computed with
         return _without_autocast(function.apply)(*arguments)
     watched = torch._C._len_torch_dispatch_stack() > 0 or not isinstance(overload, torch._ops.OpOverload)
-    if watched or op not in _kernels or _casting(arguments):
+    if watched or casts or device == "meta" or op not in _kernels:
         return overload(*arguments)
     return _kernels[op](None, *arguments)  # the dispatcher would convert all arguments there and back
-
-
-def _casting(arguments: Sequence[Any]) -> bool:
-    device = next(x for x in arguments if isinstance(x, Tensor)).device.type
-    return device == "meta" or torch.is_autocast_enabled(device)
 
 
 def _function_of(op: str, backward: Callable, setup: Callable, jvp: Callable | None, batched: Callable) -> type:

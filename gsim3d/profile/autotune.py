@@ -7,8 +7,8 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from gsim3d.effects.plan import Workload
 from gsim3d.errors import InputError
+from gsim3d.evaluate.plan_costs import Workload
 from gsim3d.evaluate.plan_report import TIMES, PartTimes
 from gsim3d.evaluate.report import write_json
 from gsim3d.io.machine import machine

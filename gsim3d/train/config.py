@@ -195,7 +195,7 @@ class TrainConfig:
     #: overrides of the preset, nested like the model section of a checkpoint's config.yaml
     model: dict = dataclasses.field(default_factory=dict)
     #: .safetensors file of Depth Anything 3 or DINOv2 that a new run with ``backbone: vit_dpt`` starts from
-    #: (:func:`gsim3d.nn.multiview_encoder.depth_weights.load_depth_weights`); empty: none
+    #: (:func:`gsim3d.compat.depth_weights.load_depth_weights`); empty: none
     pretrained_depth: str = ""
     #: effects to simulate, see :class:`gsim3d.effects.spec.EffectsSpec`
     effects: dict = dataclasses.field(default_factory=dict)

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from gsim3d.compat.depth_weights import load_depth_weights
 from gsim3d.data import Scene, generator
 from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import InputError, NumericalError, RunStopped
@@ -22,7 +23,6 @@ from gsim3d.evaluate.perceptual.lpips import LPIPS
 from gsim3d.evaluate.perceptual.weights import load
 from gsim3d.io import checkpoint
 from gsim3d.io.locks import only_one_writer
-from gsim3d.nn.multiview_encoder.depth_weights import load_depth_weights
 from gsim3d.pretrained.loading import check_device
 from gsim3d.state import concatenate
 from gsim3d.train.captured import CapturedLoss, Prepared

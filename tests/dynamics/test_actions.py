@@ -7,9 +7,9 @@ import torch
 
 from gsim3d import Actions
 from gsim3d.cuda_graphs import CapturedRollout
-from gsim3d.effects.plan import Workload, predicted_cost
 from gsim3d.effects.spec import AppearanceEffects, DynamicsEffects, EffectsSpec, Sleep, UnsupportedEffect
 from gsim3d.errors import InputError
+from gsim3d.evaluate.plan_costs import Workload, predicted_cost
 from gsim3d.io import read_particles, write_particles
 from gsim3d.presets import ModelConfig
 from gsim3d.pretrained.loading import with_weights

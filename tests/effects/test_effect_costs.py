@@ -7,8 +7,8 @@ import torch
 
 from gsim3d.dynamics import Partition
 from gsim3d.dynamics.frozen_context import Reader
-from gsim3d.effects.plan import Workload, background_cost, predicted_cost
 from gsim3d.effects.spec import DynamicsEffects, EffectsSpec
+from gsim3d.evaluate.plan_costs import Workload, background_cost, predicted_cost
 from gsim3d.nn.point_transformer import Attention
 from gsim3d.state import FROZEN
 from tests.dynamics.scenes import TINY, make_history

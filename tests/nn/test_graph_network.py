@@ -7,8 +7,8 @@ import torch
 
 from gsim3d import InputSpec, Simulator, presets
 from gsim3d.dynamics import DynamicsConfig
-from gsim3d.effects.plan import Workload, predicted_cost
 from gsim3d.errors import InputError
+from gsim3d.evaluate.plan_costs import Workload, predicted_cost
 from gsim3d.nn.graph_network import Graph, GraphConfig
 from gsim3d.priors import PositionWavesConfig, SegmentationConfig
 from gsim3d.state import last_steps

@@ -6,9 +6,9 @@ import json
 import pytest
 
 import gsim3d
-from gsim3d.effects.plan import Workload, predicted_cost
 from gsim3d.effects.spec import DynamicsEffects, EffectsSpec
 from gsim3d.errors import InputError
+from gsim3d.evaluate.plan_costs import Workload, predicted_cost
 from gsim3d.evaluate.plan_report import TIMES, PartTimes, load_times
 from gsim3d.io.checkpoint import Checkpoint
 from gsim3d.numerics.speed import SPEEDS_FILE, Setting, load_speed

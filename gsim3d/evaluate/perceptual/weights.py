@@ -307,9 +307,9 @@ def _known_value(name: str) -> str:
 @torch.no_grad()
 def _tokens_of_a_ramp() -> Tensor:
     """Last tokens [256, 384] of DINOv2 for an image of 224 pixels."""
+    from gsim3d.compat.depth_weights import load_depth_weights
     from gsim3d.nn.multiview_encoder import Encoder, EncoderConfig
     from gsim3d.nn.multiview_encoder.config import ViTConfig
-    from gsim3d.nn.multiview_encoder.depth_weights import load_depth_weights
 
     encoder = Encoder(EncoderConfig(backbone="vit_dpt", vit=ViTConfig("dinov2_small")))
     load_depth_weights(encoder, _file("dinov2_small"))

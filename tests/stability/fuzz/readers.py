@@ -33,6 +33,7 @@ import trimesh
 import yaml
 from safetensors.torch import save_file
 
+from gsim3d.compat.depth_weights import load_depth_weights
 from gsim3d.compat.released_import import import_released
 from gsim3d.data import Scene
 from gsim3d.data.check import check_scene
@@ -59,7 +60,6 @@ from gsim3d.io.sequence import open_sequence, write_about
 from gsim3d.io.settings import from_dict, to_dict
 from gsim3d.nn.multiview_encoder import Encoder
 from gsim3d.nn.multiview_encoder.config import ViTConfig
-from gsim3d.nn.multiview_encoder.depth_weights import load_depth_weights
 from gsim3d.numerics.speed import load_speed
 from gsim3d.numerics.trust import Trust, load_trust
 from gsim3d.simulator import Simulator

@@ -7,10 +7,10 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from gsim3d.compat.depth_weights import load_depth_weights
 from gsim3d.errors import InputError
 from gsim3d.nn.multiview_encoder import Encoder, EncoderConfig
 from gsim3d.nn.multiview_encoder.config import ViTConfig
-from gsim3d.nn.multiview_encoder.depth_weights import load_depth_weights
 from tests.nn.multiview_encoder.published_keys import keys_of, state_dict_of
 
 STARTS = {"model.backbone.pretrained.": "backbone.", "model.head.": "depth_head.", "model.cam_enc.": "camera_encoder."}
