@@ -11,6 +11,7 @@ from gsim3d.cli.main import main
 from gsim3d.data import Scene, find_scenes
 from gsim3d.errors import InputError
 from gsim3d.nn.multiview_encoder import Encoder
+from gsim3d.train import captured as captured_module
 from gsim3d.train.config import DataConfig, OptimizerConfig, PhaseConfig, TrainConfig
 from gsim3d.train.features import FeatureCache
 from gsim3d.train.loop import Trainer, deterministic
@@ -119,8 +120,9 @@ def test_a_run_starts_from_published_weights(scenes, tmp_path):
         Trainer(config, scenes, tmp_path / "c")
 
 
-def test_steps_of_a_graph_read_kept_features(scenes, tmp_path):
+def test_steps_of_a_graph_read_kept_features(scenes, tmp_path, monkeypatch):
     """The computation that a GPU captures, step by step on the CPU."""
+    monkeypatch.setattr(captured_module, "FACTOR", 2.0)  # both batches fit into one graph
     config = dataclasses.replace(CONFIG, optimizer=OptimizerConfig(ema_decay=0))
     trainer, plain = Trainer(config, scenes, tmp_path / "a"), Trainer(config, scenes, tmp_path / "b")
     trainer.captured = trainer._capture()
