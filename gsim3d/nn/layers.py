@@ -24,8 +24,8 @@ MIN_ROWS = 16  # matrix products of fewer rows go through other code in BLAS, wh
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None, *, gelu: bool = False) -> Tensor:
     """``F.linear``, or ``F.gelu`` of it; in float32 on the CPU by oneDNN, which is faster than BLAS on some."""
     traced = torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0
-    narrow = not x.is_cpu or not x.dtype == weight.dtype == torch.float32 or torch.is_autocast_enabled("cpu")
-    if torch.compiler.is_compiling() or traced or narrow or not torch.backends.mkldnn.is_available():
+    unsuited = not x.is_cpu or not x.dtype == weight.dtype == torch.float32 or torch.is_autocast_enabled("cpu")
+    if torch.compiler.is_compiling() or traced or unsuited or not torch.backends.mkldnn.is_available():
         out = F.linear(x, weight, bias)
     elif torch.is_grad_enabled():
         out = _OneDnnLinear.apply(x, weight, bias)

@@ -94,7 +94,7 @@ class CapturedLoss:
         recompute: see TrainConfig.
         leaves_out: see ``leave_one_out`` of DataConfig.
         whole: the loss compares images of different steps. Otherwise each segment of a rollout (``Batch.cut``) has its
-            backward pass before the next one begins, so that memory is that of the longest segment.
+            backward pass before the next one begins, which frees its activations.
 
     Attributes:
         parameters: all parameters of the simulator, in the order of the gradients returned.

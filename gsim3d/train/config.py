@@ -30,7 +30,7 @@ class PhaseConfig:
     #: proportion.
     horizon: int = 0
     #: largest number of simulated steps that gradients flow through; longer horizons are simulated in segments without
-    #: gradients between them, and with ``captured`` memory is that of one segment. 0: all.
+    #: gradients between them; with ``captured`` each has its backward pass before the next. 0: all.
     cut: int = 0
     history: int = 0  #: number of encoded steps; 0: ``data.history``
     batch: int = 1  #: scenes per optimizer step, over all processes

@@ -378,6 +378,26 @@ def test_reserved_capacity_is_there_from_the_first_step(scenes, trainer, device)
     torch.testing.assert_close(loss, run(captured_loss(trainer), small, trainer).loss, rtol=1e-4, atol=0)
 
 
+def test_sizes_that_fit_are_remembered(scenes, trainer, device, monkeypatch):
+    small, large = (batch.to(device) for batch in batches(scenes, 2))
+    other = captured_loss(trainer)
+    run(other, large, trainer)
+    ((clouds, needed),) = other.most.items()
+    monkeypatch.setattr(captured_module, "FACTOR", 3.0)
+    captured = captured_loss(trainer)
+    captured.most_particles, captured.most_moving = other.most_particles, other.most_moving
+    run(captured, small, trainer)
+    assert captured.captures == 1 and any(a < b for a, b in zip(captured.most[clouds], needed, strict=True))
+    run(captured, large, trainer)
+    assert captured.captures == 1 and all(a >= b for a, b in zip(captured.most[clouds], needed, strict=True))
+
+
+def test_margins_of_older_states_are_taken_off(trainer):
+    captured = captured_loss(trainer)
+    captured.reserve({"rows": 9, "moving": 3, "geometry": [[[0], [0, 1], [15, 31]]]})
+    assert captured.most[(0,), (0, 1)] == (10, 21)
+
+
 def test_capacity_grows_where_a_batch_needs_more(scenes, trainer, device):
     captured = captured_loss(trainer)
     batch = batches(scenes, 1)[0].to(device)
