@@ -222,7 +222,7 @@ def test_next_run_goes_on_from_state(first_run, store, tmp_path):
     assert dataclasses.replace(progress, curve=[]) == dataclasses.replace(done, curve=[])
     other = RunTrainer(CONFIG, store, tmp_path / "again", "cpu")
     assert load_into(other, state, NAME).step == other.step == 3
-    for name, value in trainer.simulator.state_dict().items():
+    for name, value in trainer.average.items():
         again = other.simulator.state_dict()[name]
         assert (again - value).abs().max() <= value.abs().max() / 127, name
         assert value.ndim > 1 or torch.equal(again, value)
@@ -429,5 +429,5 @@ def test_new_priors_begin_at_their_first_values(first_run, store, tmp_path):
         name.startswith("dynamics.priors.position_waves.") for name in other.new_parameters
     )
     for name, value in other.simulator.state_dict().items():
-        known = first[name] if name in other.new_parameters else trainer.simulator.state_dict()[name]
+        known = first[name] if name in other.new_parameters else trainer.average[name]
         assert torch.allclose(value, known, atol=known.abs().max().item() / 100), name

@@ -1,10 +1,10 @@
 """State of a training run that goes on from machine to machine: one file of about a byte a weight.
 
-``NAME.state.safetensors`` holds the weights as int8 in blocks of 64 with a scale each (vectors in float32), AdamW's
-averages of squared gradients as means over rows and columns of each matrix (Shazeer and Stern 2018, "Adafactor"), the
-training curve, and as metadata what :class:`Progress` says. First moments begin at zero, the averaged weights at the
-weights: a run starts with a warm-up. ``NAME.weights.safetensors`` beside it is a checkpoint with the averaged weights
-in bfloat16, to predict with; the state does not need it.
+``NAME.state.safetensors`` holds the averaged weights as int8 in blocks of 64 with a scale each (vectors in float32),
+AdamW's averages of squared gradients as means over rows and columns of each matrix (Shazeer and Stern 2018,
+"Adafactor"), the training curve, and as metadata what :class:`Progress` says. The next run begins at the averaged
+weights, which are less noisy than those of the last step, with first moments of zero and a warm-up.
+``NAME.weights.safetensors`` beside it is a checkpoint with the same weights in bfloat16, to predict with.
 """
 
 import dataclasses
@@ -116,7 +116,7 @@ def save_state(trainer: Trainer, folder: str | Path, name: str, progress: Progre
         progress, step=trainer.step, seconds=round(trainer.seconds, 1), n_skipped=trainer.n_skipped
     )
     tensors: dict[str, Tensor] = {}
-    for key, value in trainer.simulator.state_dict().items():
+    for key, value in (trainer.average or trainer.simulator.state_dict()).items():
         tensors |= _packed(key, value.cpu())
     for key, parameter in trainer.parameters.items():
         if "exp_avg_sq" in (state := trainer.optimizer.state[parameter]):
