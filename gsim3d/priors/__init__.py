@@ -12,6 +12,7 @@ from gsim3d.priors.position_waves import PositionWaves, PositionWavesConfig
 from gsim3d.priors.proximity import Proximity, ProximityConfig
 from gsim3d.priors.segmentation import Segmentation, SegmentationConfig
 from gsim3d.priors.shape_matching import ShapeMatching, ShapeMatchingConfig
+from gsim3d.priors.velocity import Velocity, VelocityConfig
 from gsim3d.priors.velocity_from_images import VelocityFromImages, VelocityFromImagesConfig
 
 __all__ = [
@@ -37,6 +38,8 @@ __all__ = [
     "ShapeMatching",
     "ShapeMatchingConfig",
     "StepContext",
+    "Velocity",
+    "VelocityConfig",
     "VelocityFromImages",
     "VelocityFromImagesConfig",
 ]

@@ -17,6 +17,7 @@ from gsim3d.ops.validate_state import CELLS
 from gsim3d.state import DYNAMIC, Particles, constant
 
 SAMPLES = 1024  # largest number of samples of a subset
+SHIFT_PASSES = 3  # mean-shift iterations that follow a window from cloud to cloud
 LEAST_LOGIT = -60.0  # smallest logit of a weight; avoids denormals, which are slow on a CPU
 
 
@@ -212,3 +213,16 @@ def squared_distances(a: Tensor, b: Tensor) -> Tensor:
     """Squared distances [B, G, S] between ``a`` [B, G, C] and ``b`` [B, S, C]."""
     found = torch.baddbmm(b.square().sum(2)[:, None], a, b.mT, alpha=-2)
     return found.add_(a.square().sum(2)[:, :, None]).clamp_(min=0)
+
+
+def mean_shift(now: Samples, then: Samples, nodes: Tensor, radius: float) -> Tensor:
+    """Displacement [B, G, 3], since ``then``, of the particles in a Gaussian window of each node, by mean shift."""
+    around = _mean_around(nodes, now, radius)
+    moved = (now.mean - then.mean)[:, None].expand_as(nodes)
+    for _ in range(SHIFT_PASSES):
+        moved = around - _mean_around(nodes - moved, then, radius)
+    return moved
+
+
+def _mean_around(nodes: Tensor, samples: Samples, radius: float) -> Tensor:
+    return weights(squared_distances(nodes, samples.positions) * (-0.5 / radius**2), samples.known) @ samples.positions

@@ -11,12 +11,11 @@ from torch.nn import functional as F
 from gsim3d.cameras import Frames
 from gsim3d.priors.base import Prior, PriorConfig, StepContext
 from gsim3d.priors.movable import Windows
-from gsim3d.priors.padding import PaddedClouds, Samples, Subset, squared_distances, weights
+from gsim3d.priors.padding import PaddedClouds, Samples, Subset, mean_shift
 from gsim3d.priors.rigid import next_displacement, solve3
 from gsim3d.state import Particles, constant
 
 PASSES = 5  # Gauss-Newton iterations of the alignment
-SHIFT_PASSES = 3  # mean-shift iterations that follow a window from cloud to cloud
 SHOWN = 0.9  # smallest fraction of a pixel window that must show movable particles
 STIFF, STILL = 1e-4, 0.3  # damping of rotation and translation, relative to the mean diagonal of the normal equations
 GREY = 0.02  # added to the sum of a colour in its normalisation
@@ -98,7 +97,7 @@ def estimate_velocity(
             then.center(movable.center)
             before = _Views(frames, particles, *images, earlier, movable.center, config)
             spans = constant(tuple(steps[q] - steps[e] for e, q in zip(earlier, newest)), spin.device)
-            start = _shift(now, then, windows.nodes, config.radius), spans[:, None, None] * spin
+            start = mean_shift(now, then, windows.nodes, config.radius), spans[:, None, None] * spin
             known = (spans > 0) & (now.n > 0) & (then.n > 0)
             per_step = (known / spans.clamp(min=1))[:, None, None].to(now.positions.dtype)
             velocity, spin = (x * per_step for x in _align(windows, center, *start, seen, before, config))
@@ -245,16 +244,3 @@ def _smoothed(images: Tensor, blur: float) -> Tensor:
     ticks = (torch.arange(n, device=images.device, dtype=images.dtype) for n in images.shape[3:])
     down, across = (((x[:, None] - x).square() * (-0.5 / blur**2)).softmax(1) for x in ticks)
     return down @ images @ across.T
-
-
-def _shift(now: Samples, then: Samples, nodes: Tensor, length: float) -> Tensor:
-    """Displacement [B, G, 3] of the particles in the window of each node, by mean shift."""
-    around = _mean_around(nodes, now, length)
-    moved = (now.mean - then.mean)[:, None].expand_as(nodes)
-    for _ in range(SHIFT_PASSES):
-        moved = around - _mean_around(nodes - moved, then, length)
-    return moved
-
-
-def _mean_around(nodes: Tensor, samples: Samples, length: float) -> Tensor:
-    return weights(squared_distances(nodes, samples.positions) * (-0.5 / length**2), samples.known) @ samples.positions
