@@ -330,8 +330,8 @@ class Particles(TensorRecord):
             (:mod:`gsim3d.effects.actors`).
         initial_latents: [N, Fd], the dynamic latents at the start of the simulation; only in models with
             ``background="relightable"``.
-        velocity: [N, 3] metres per step: the last displacement of simulated particles, the mean displacement since the
-            oldest step for encoded particles of the newest step, 0 otherwise; only in models with inertia.
+        velocity: [N, 3] metres per step: the last displacement of simulated particles (smoothed by the prior velocity),
+            the mean one of the history for encoded particles of the newest step, 0 otherwise.
         irradiance_gain: [N, 3], factors of the colours of simulated particles: irradiance now over irradiance at
             encoding; only in models with lights.
         light_occlusion: [N, 2 L], optical depth towards each light at encoding and now, or [N, 3 L]: irradiance at

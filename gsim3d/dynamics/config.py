@@ -88,7 +88,7 @@ class DynamicsConfig(TransformerConfig):
             'predicts "from_newest" or "from_previous"': prior.acts and self.predicts == "absolute",
             "a latent model (not explicit)": prior.latent_only and self.explicit,
             'background "symmetric" or "relightable"': prior.reads_background and self.is_asymmetric,
-            "a model without actions": prior.acts and bool(self.actions),
+            "a model without actions": prior.acts and not prior.is_local and bool(self.actions),
             "the point transformer (no graph)": self.graph and (prior.n_conv_features or prior.n_features),
         }
         for needed, lacks in needs.items():

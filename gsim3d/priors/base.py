@@ -181,13 +181,14 @@ class Prior(nn.Module):
         replaces_displacement: whether the network predicts gains only, and no displacement.
         latent_only: whether it does not support explicit models.
         reads_background: whether it needs frozen particles in the history, which asymmetric models leave out.
+        is_local: whether it moves a particle by its own attributes alone, so that action particles may be among them.
     """
 
     attributes: tuple[str, ...] = ()
     requires: tuple[str, ...] = ()
     n_conv_features = n_features = n_gains = 0
     gains_change = "means"
-    replaces_displacement = latent_only = reads_background = False
+    replaces_displacement = latent_only = reads_background = is_local = False
 
     def __init_subclass__(cls, config: type[PriorConfig] | None = None, **kwargs):
         super().__init_subclass__(**kwargs)

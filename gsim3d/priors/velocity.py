@@ -40,6 +40,7 @@ class Velocity(Prior, config=VelocityConfig):
 
     attributes = ("velocity",)
     n_features = n_gains = 3
+    is_local = True
 
     def initialize(self, particles: Particles, ctx: StepContext, frames: Frames | None = None) -> Particles:
         if frames is None or ctx.is_empty:

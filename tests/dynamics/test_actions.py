@@ -13,7 +13,7 @@ from gsim3d.evaluate.plan_costs import Workload, predicted_cost
 from gsim3d.io import read_particles, write_particles
 from gsim3d.presets import ModelConfig
 from gsim3d.pretrained.loading import with_weights
-from gsim3d.priors import InertiaConfig
+from gsim3d.priors import InertiaConfig, VelocityConfig
 from gsim3d.simulator import Simulator
 from gsim3d.state import ASLEEP, DYNAMIC
 from tests.asserts import assert_same_bits
@@ -30,11 +30,13 @@ def acting(config: ModelConfig) -> ModelConfig:
     return dataclasses.replace(config, dynamics=dataclasses.replace(config.dynamics, actions=TYPES))
 
 
-def with_background(background: str) -> ModelConfig:
-    return dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, background=background))
+def without_actions(name: str) -> ModelConfig:
+    """A model with that background, or with the prior velocity."""
+    changes = {"priors": (VelocityConfig(),)} if name == "velocity" else {"background": name}
+    return dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, **changes))
 
 
-CONFIGS = {name: acting(with_background(name)) for name in ("symmetric", "relightable", "asymmetric")}
+CONFIGS = {name: acting(without_actions(name)) for name in ("symmetric", "relightable", "asymmetric", "velocity")}
 
 
 def setting(config=CONFIGS["symmetric"], steps=(2,)):
@@ -105,7 +107,7 @@ def test_without_actors_bits_are_those_of_a_model_without_embeddings(name):
     simulator, state, actions = setting(CONFIGS[name])
     weights = {k: v for k, v in simulator.state_dict().items() if not k.startswith("dynamics.actions.")}
     assert len(simulator.state_dict()) == len(weights) + 2
-    plain = Simulator(with_background(name)).eval()
+    plain = Simulator(without_actions(name)).eval()
     plain.load_state_dict(weights)
     wanted = rollout(plain, state)
     assert_same_steps(rollout(simulator, state), wanted)

@@ -1,0 +1,168 @@
+"""Velocities of encoded clouds, as features and gains."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from gsim3d.priors import Motion, VelocityConfig
+from gsim3d.priors.velocity import slope_weights, window_velocity
+from gsim3d.state import DYNAMIC, FROZEN
+from tests.asserts import assert_close_relative_to_max, assert_same_bits
+from tests.dynamics.scenes import TINY, batch, make_dynamics, make_history
+from tests.priors.scenes import context, with_priors
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+CELL, RADIUS, FRAMES = 0.02, 0.3, object()
+PLAIN = dataclasses.replace(TINY, position_features=False)
+MOVING = with_priors(PLAIN, VelocityConfig())
+
+
+def flown(counts=(300, 340, 280, 310), velocity=(0.004, -0.003, 0.001), seed=0, noise=0.0, steps=None):
+    """Clouds of a body that moves by ``velocity`` a step; each shows other points of it."""
+    history, g = make_history(counts, seed=seed, frozen_share=0.0), torch.Generator().manual_seed(seed)
+    steps = history.clouds.steps if steps is None else steps
+    clouds = [
+        1.0 + 0.2 * _even(n, g) + step * torch.tensor(velocity) + noise * torch.randn(3, generator=g)
+        for n, step in zip(counts, steps, strict=True)
+    ]
+    clouds = torch.cat(clouds) + history.origin[0].float()
+    return dataclasses.replace(history, means=clouds, activity=torch.full_like(history.activity, DYNAMIC))
+
+
+def _even(n, g):
+    """``n`` points of a ball with mean 0."""
+    points = torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=1)
+    return points - points.mean(0)
+
+
+def of(history, radius=RADIUS):
+    return window_velocity(context(history, grid_size=CELL), radius)
+
+
+def moving(value=0.004, **options):
+    """A history whose particles have a velocity."""
+    history = make_history(**options)
+    return dataclasses.replace(history, velocity=torch.full_like(history.means, value))
+
+
+def newest(history):
+    return history.means[history.cu_rows[-2] :]
+
+
+def test_slope_of_a_line():
+    weights, divisor = slope_weights([3, 2, 1])
+    assert (weights, divisor) == ([6, 2, -2], 20)
+    assert sum(w * 0.7 * age for w, age in zip(weights, [3, 2, 1])) / divisor == pytest.approx(0.7)
+    assert slope_weights([]) == ([], 1)
+    weights, divisor = slope_weights([5, 1])
+    assert sum(w * age for w, age in zip(weights, [5, 1])) / divisor == pytest.approx(1)
+
+
+def test_velocity_of_clouds_below_a_cell():
+    history = flown()
+    found = of(history, radius=10.0)  # a window that holds all of the body: the clouds show different points
+    assert (found - torch.tensor([0.004, -0.003, 0.001])).abs().max() < 1e-5
+
+
+def test_windows_follow_bodies_apart():
+    left, right = flown(velocity=(0.0, 0.01, 0.0)), flown(velocity=(0.0, -0.01, 0.0), seed=1)
+    n = [end - begin for begin, end in zip(left.cu_rows[:-1].tolist(), left.cu_rows[1:].tolist())]
+    parts = [[part for cloud in zip(left.means.split(n), right.means.split(n)) for part in cloud]]
+    wide = make_history(tuple(2 * k for k in n), frozen_share=0.0)
+    means = torch.cat(
+        [part + (0.0 if i % 2 == 0 else 3.0) * torch.tensor([1.0, 0, 0]) for i, part in enumerate(parts[0])]
+    )
+    found = of(dataclasses.replace(wide, means=means, activity=torch.full_like(wide.activity, DYNAMIC)))
+    assert (found[: n[-1]] - torch.tensor([0.0, 0.01, 0.0])).abs().max() < 2e-3
+    assert (found[n[-1] :] + torch.tensor([0.0, 0.01, 0.0])).abs().max() < 2e-3
+
+
+def test_slope_is_less_noisy_than_the_last_difference():
+    errors = []
+    for seed in range(20):
+        history = flown(seed=seed, noise=0.001)
+        means = [part.mean(0) for part in history.means.split([300, 340, 280, 310])]
+        true = torch.tensor([0.004, -0.003, 0.001])
+        errors.append(torch.stack([of(history, radius=10.0)[0] - true, means[3] - means[2] - true]).norm(dim=1))
+    slope, last = torch.stack(errors).square().mean(0).sqrt()
+    assert slope < 0.5 * last
+
+
+@pytest.mark.parametrize("counts", [(0, 0, 0, 200), (200,), (0, 200, 0, 210), (200, 190, 0, 0)])
+def test_missing_clouds(counts):
+    found = of(flown(counts)) if counts[-1] else of(flown(counts)).reshape(-1, 3)
+    assert found.isfinite().all() and found.shape == (counts[-1], 3)
+    if sum(n > 0 for n in counts) < 2:
+        assert not found.any()
+
+
+def test_frozen_particles_and_older_clouds_have_none():
+    history = flown()
+    activity = history.activity.clone()
+    activity[-50:] = FROZEN
+    history = dataclasses.replace(history, activity=activity)
+    ctx = context(history, VelocityConfig(), grid_size=CELL)
+    prior = ctx.priors.get("velocity")
+    velocity = prior.initialize(ctx.history, ctx, FRAMES).velocity
+    assert not velocity[-50:].any() and velocity[-310:-50].any(1).all() and not velocity[:-310].any()
+    assert prior.initialize(ctx.history, ctx) is ctx.history  # edits keep velocities
+    assert_same_bits(prior.features(ctx), ctx.history.velocity / CELL)
+
+
+def test_scenes_are_independent():
+    one, other = flown(), flown((200, 220), velocity=(0.0, 0.02, 0.0), seed=3)
+    both = of(batch([one, other]))
+    assert_close_relative_to_max(both[:310], of(one), 1e-5)
+    assert_close_relative_to_max(both[310:], of(other), 1e-5)
+
+
+def test_a_network_without_it_is_blind_below_a_cell_and_one_with_it_is_not():
+    slow, fast, plain, seeing = moving(0.004), moving(0.006), make_dynamics(PLAIN), make_dynamics(MOVING)
+    assert_same_bits(plain(fast).means, plain(slow).means)
+    assert_same_bits(seeing(fast).means, seeing(slow).means)  # projections begin at 0
+    torch.nn.init.normal_(seeing.priors.get("velocity").in_proj.weight)
+    assert (seeing(fast).means - seeing(slow).means).abs().max() > 1e-4
+
+
+def test_gains_carry_velocities_on():
+    history = moving(0.004, frozen_share=0.0)
+    ctx = context(history, VelocityConfig(), grid_size=CELL)
+    prior, n = ctx.priors.get("velocity"), len(newest(history))
+    gains = 2 * torch.atanh(torch.tensor([0.5, 0.0, -0.25])).expand(n, 3)
+    motion = prior.move(Motion.of_network(torch.zeros(n, 3)), gains, ctx)
+    assert_close_relative_to_max(motion.total(), torch.tensor([0.004, 0.0, -0.002]).expand(n, 3), 1e-5)
+
+
+def test_a_step_halves_the_old_velocity():
+    history = moving(0.004)
+    step = make_dynamics(MOVING)(history)
+    moved = step.means - newest(history)
+    assert moved.abs().max() > 0
+    assert_close_relative_to_max(step.velocity, (moved + 0.004) / 2, 1e-6)
+
+
+def test_velocity_of_a_steady_fall_does_not_jump_at_the_first_step():
+    """Encoded and simulated velocities of a body in free fall lag behind by the same 1.5 steps."""
+    fall = torch.tensor([0.0, 0.0, -0.0056])
+    at = [fall * step**2 / 2 for step in range(12)]
+    slopes = [sum((k - 1.5) * at[t - 3 + k] for k in range(4)) / 5 for t in range(3, 12)]
+    smoothed = [slopes[0]]
+    for t in range(4, 12):
+        smoothed.append((smoothed[-1] + at[t] - at[t - 1]) / 2)
+    assert torch.allclose(torch.stack(smoothed), torch.stack(slopes), atol=1e-7)
+
+
+def test_gradients_flow_through_displacements_only():
+    dynamics, history = make_dynamics(MOVING), moving()
+    torch.nn.init.constant_(dynamics.priors.get("velocity").gain_head.bias, 1.0)
+    start = dynamics(history)
+    velocity = start.velocity.detach().requires_grad_()
+    later = dynamics(dynamics(dataclasses.replace(start, velocity=velocity)))
+    (gradient,) = torch.autograd.grad(later.means.sum(), velocity)
+    gain = 2 * torch.tanh(torch.tensor(0.5))
+    moves = (start.activity == DYNAMIC)[:, None].expand(-1, 3)
+    assert_close_relative_to_max(gradient[moves], (gain + gain * (1 + gain) / 2).expand(int(moves.sum())), 1e-5)
+    assert not gradient[~moves].any()
+    history = flown()
+    assert not of(dataclasses.replace(history, means=history.means.requires_grad_())).requires_grad
