@@ -166,3 +166,8 @@ def test_gradients_flow_through_displacements_only():
     assert not gradient[~moves].any()
     history = flown()
     assert not of(dataclasses.replace(history, means=history.means.requires_grad_())).requires_grad
+
+
+def test_on_gpu(devices):
+    expected, actual = (of(flown().to(device)).cpu() for device in devices)
+    assert_close_relative_to_max(actual, expected, 1e-4)

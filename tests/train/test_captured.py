@@ -95,7 +95,7 @@ ALL_MOVING = dataclasses.replace(
 )
 ACTING = dataclasses.replace(
     CONFIG,
-    model={"dynamics": {"actions": ["hand", "pusher"], "background": "relightable"}},
+    model={"dynamics": {"actions": ["hand", "pusher"], "background": "relightable", "priors": [{"type": "velocity"}]}},
     effects={"dynamics": {"actions": ["hand", "pusher"]}},
 )
 KINDS = {
