@@ -48,7 +48,7 @@ from gsim3d.train.log import (
     progress_note,
     sample_video,
 )
-from gsim3d.train.losses import time_weights, training_loss
+from gsim3d.train.losses import draw_alone, time_weights, training_loss
 from gsim3d.train.optimizer import FIRST_SCALE, LossScale, Optimizer, deterministic, one_cycle, update_average
 from gsim3d.train.processes import Processes
 from gsim3d.train.restore import build_simulator, describe, keep_jacobian, model_config
@@ -135,8 +135,8 @@ class Trainer:
         return distance
 
     def _capture(self) -> CapturedLoss:
-        precision = partial(self.config.precision.of, device=self.device)
-        parts = self.config.recompute, self.config.data.leave_one_out, self.config.loss.image_gain
+        precision, loss = partial(self.config.precision.of, device=self.device), self.config.loss
+        parts = self.config.recompute, self.config.data.leave_one_out, loss.image_gain, loss.bodies > 0
         return CapturedLoss(self.simulator, self.plan, self.loss_of_images, precision, *parts)
 
     # ---- the loop ----
@@ -383,8 +383,8 @@ class Trainer:
 
     def loss(self, batch: Batch, sample: int = 0, watch: StepWatch | None = None) -> tuple[Tensor, Tensor]:
         """Computes the loss of a batch and the unweighted mean squared error of each step; ``sample`` seeds noise."""
-        images = self._images(batch, sample, watch or StepWatch())
-        return self.loss_of_images(images, batch.targets, self.step_weights(batch))
+        images, alone = self._images(batch, sample, watch or StepWatch())
+        return self.loss_of_images(images, batch.targets, self.step_weights(batch), alone)
 
     def step_weights(self, batch: Batch) -> Tensor:
         """Returns the weight [S] of each step of a batch."""
@@ -392,8 +392,9 @@ class Trainer:
         weights = time_weights(batch.n_context, batch.n_future, balance=settings.balance, discount=settings.discount)
         return weights.to(self.device)
 
-    def _images(self, batch: Batch, sample: int, watch: StepWatch) -> Tensor:
-        """Predicts the images of the target cameras of a batch, each part of the model in its precision."""
+    def _images(self, batch: Batch, sample: int, watch: StepWatch) -> tuple[Tensor, Tensor | None]:
+        """Predicts the images of the target cameras of a batch, each part of the model in its precision, and those of
+        bodies alone if the loss compares them."""
         simulator, precision = self.simulator, self.config.precision
         again = recomputing(self.config.recompute, simulator)
         options = {"report": watch.report, "on_invalid": "drop" if watch.strict else None}
@@ -425,8 +426,9 @@ class Trainer:
                 images = draw_left_out(render, particles, batch.targets, images_per_cloud(batch.context))
             else:
                 images = render(particles, batch.targets.cameras, batch.targets.valid)
+            alone = draw_alone(render, particles, batch.targets) if self.config.loss.bodies else None
         watch.report.close()  # recomputation in the backward pass must not count again
-        return images
+        return images, alone
 
     def draw_sample(self, scene: Scene | None = None) -> Sample:
         """Predicts the first window of ``scene`` (default: the first scene) with the current weights."""
