@@ -214,6 +214,7 @@ ATTRIBUTES = {
         _kept("actor", (), "index", -1, validated=False, dtype=torch.int64),
         _kept("initial_latents", default="dynamic_latents", validated=False),
         Attribute("velocity", (3,), "vector", 0.0),
+        Attribute("mean_velocity", (3,), "vector", 0.0),
         Attribute("irradiance_gain", (3,), "scalar", 1.0),
         _kept("light_occlusion", default=-1.0, validated=False),
         _kept("rest_positions", (3,), "point", "means", validated=False),
@@ -221,6 +222,8 @@ ATTRIBUTES = {
         _kept("label", (), "index", -1, validated=False, dtype=torch.int64),
     )
 }
+
+VELOCITIES = ("velocity", "mean_velocity")
 
 
 def attributes_of(*kinds: str) -> tuple[str, ...]:
@@ -326,14 +329,12 @@ class Particles(TensorRecord):
         color_transform: [N, 3, 3], a matrix that decoded colours of latent models are multiplied by; set by edits.
         frozen_appearance: bool [N], particles whose changing latents and colours stay constant; only where an effects
             spec selects them (``appearance.frozen_appearance``). Resolved once at the start of a rollout.
-        actor: int64 [N], number of the actor that moves a particle, -1: none; only in rollouts with actors
-            (:mod:`gsim3d.effects.actors`).
-        initial_latents: [N, Fd], the dynamic latents at the start of the simulation; only in models with
-            ``background="relightable"``.
-        velocity: [N, 3] metres per step: the last displacement of simulated particles (smoothed by the prior velocity),
-            the mean one of the history for encoded particles of the newest step, 0 otherwise.
-        irradiance_gain: [N, 3], factors of the colours of simulated particles: irradiance now over irradiance at
-            encoding; only in models with lights.
+        actor: int64 [N], number of the actor (:mod:`gsim3d.effects.actors`) that moves a particle, -1: none.
+        initial_latents: [N, Fd], the dynamic latents at the start, in models with ``background="relightable"``.
+        velocity: [N, 3] metres per step: the last displacement of simulated particles, an estimate for encoded
+            particles of the newest step, 0 otherwise; only in models with a prior that reads it.
+        mean_velocity: as ``velocity``, over the last steps (:class:`gsim3d.priors.Velocity`).
+        irradiance_gain: [N, 3], irradiance now over that at encoding, factors of colours in models with lights.
         light_occlusion: [N, 2 L], optical depth towards each light at encoding and now, or [N, 3 L]: irradiance at
             encoding, n.l, and irradiance now; negative where unknown.
         rest_positions: [N, 3] metres, positions at the start of the simulation, the rest shape of elastic bodies; only
@@ -366,6 +367,7 @@ class Particles(TensorRecord):
     actor: Tensor | None = None
     initial_latents: Tensor | None = None
     velocity: Tensor | None = None
+    mean_velocity: Tensor | None = None
     irradiance_gain: Tensor | None = None
     light_occlusion: Tensor | None = None
     rest_positions: Tensor | None = None
@@ -483,6 +485,12 @@ class Newest:
         if self._newest is None:
             self._newest = last_steps(self._particles, 1)
         return self._newest
+
+
+def with_velocity(particles: Particles, rows: Tensor, velocity: Tensor) -> Particles:
+    """Returns ``particles`` with ``velocity`` [N, 3] where ``rows``, bool [N, 1], in those of VELOCITIES they have."""
+    known = {name: value for name in VELOCITIES if (value := getattr(particles, name)) is not None}
+    return dataclasses.replace(particles, **{name: torch.where(rows, velocity, known[name]) for name in known})
 
 
 def with_attribute(particles: Particles, name: str, width: int = 3) -> Particles:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gsim3d.effects.selection import Selection, newest_mask
 from gsim3d.errors import InputError, naming
-from gsim3d.state import DYNAMIC, Particles, last_steps, newest_clouds
+from gsim3d.state import DYNAMIC, Particles, last_steps, newest_clouds, with_velocity
 
 
 @dataclass(frozen=True)
@@ -84,10 +84,8 @@ class Actors:
             coming = self._displacement(newest, 0)
             predicted = predict(self._shifted(history), *others, **options)
             rows = (newest.actor >= 0)[:, None]
-            fields = {"means": torch.where(rows, newest.means + coming, predicted.means)}
-            if predicted.velocity is not None:
-                fields["velocity"] = torch.where(rows, coming, predicted.velocity)
-            return dataclasses.replace(predicted, **fields)
+            means = torch.where(rows, newest.means + coming, predicted.means)
+            return with_velocity(dataclasses.replace(predicted, means=means), rows, coming)
 
         return step
 
@@ -102,10 +100,8 @@ class Actors:
         """Shifts older positions of actors, so that their last displacement equals the next one."""
         before, coming = self._displacement(history, -1), self._displacement(history, 0)
         newest, rows = newest_mask(history)[:, None], (history.actor >= 0)[:, None]
-        fields = {"means": torch.where(rows & ~newest, history.means + before - coming, history.means)}
-        if history.velocity is not None:
-            fields["velocity"] = torch.where(rows & newest, coming, history.velocity)
-        return dataclasses.replace(history, **fields)
+        means = torch.where(rows & ~newest, history.means + before - coming, history.means)
+        return with_velocity(dataclasses.replace(history, means=means), rows & newest, coming)
 
     def _begun(self, state: Particles) -> Particles:
         """Shifts older positions of actors, so that their last displacement equals their first one.

@@ -27,7 +27,7 @@ from gsim3d.io.files import read_yaml, shown
 from gsim3d.io.settings import from_dict
 from gsim3d.math.rotations import quat_product, rotate_left, rotation_matrices
 from gsim3d.math.spherical_harmonics import painted, rotate_harmonics
-from gsim3d.state import ATTRIBUTES, FROZEN, Particles, joined_clouds, newest_clouds, with_attribute
+from gsim3d.state import ATTRIBUTES, FROZEN, VELOCITIES, Particles, joined_clouds, newest_clouds, with_attribute
 
 Colors = Callable[[Particles], Tensor]  # particles -> [N, 3] colours
 
@@ -150,10 +150,9 @@ class Throw(Operation):
             raise InputError("a history of one step has no velocity; encode two steps or more")
         ages = torch.tensor([newest[scene] - step for scene, step in zip(table.scenes, table.steps)])
         back = ages.to(state.means)[state.row_cloud()][:, None] * state.means.new_tensor(self.velocity)
-        fields = {"means": state.means - back}
-        if state.velocity is not None:
-            fields["velocity"] = state.velocity + state.velocity.new_tensor(self.velocity)
-        return _changed(state, chosen, fields)
+        known = {name: value for name in VELOCITIES if (value := getattr(state, name)) is not None}
+        faster = {name: value + value.new_tensor(self.velocity) for name, value in known.items()}
+        return _changed(state, chosen, {"means": state.means - back, **faster})
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from gsim3d.effects.selection import Selection
 from gsim3d.envs.model import ActorRows
 from gsim3d.errors import InputError
 from gsim3d.simulator import Simulator
-from gsim3d.state import DYNAMIC, Particles, append_step, last_steps, newest_clouds
+from gsim3d.state import DYNAMIC, Particles, append_step, last_steps, newest_clouds, with_velocity
 from gsim3d.synth.mujoco_engine import check_solver, load_mujoco
 
 if TYPE_CHECKING:
@@ -105,8 +105,6 @@ class HybridScene:
             axis, angle = tuple(turn) if turn.any() else (0.0, 0.0, 1.0), np.degrees(np.linalg.norm(turn))
             turn = Rotate(ActorRows(number=number), axis, angle, tuple(after[number]))
             step = turn.apply(step, self.simulator.renderer)
-        if step.velocity is not None:
-            driven, newest = (step.actor >= 0)[:, None], last_steps(self.state, 1)
-            step = dataclasses.replace(step, velocity=torch.where(driven, step.means - newest.means, step.velocity))
+        step = with_velocity(step, (step.actor >= 0)[:, None], step.means - last_steps(self.state, 1).means)
         self.state = append_step(self.state, step, self.plan.history)
         return step

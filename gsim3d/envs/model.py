@@ -31,6 +31,7 @@ from gsim3d.state import (
     concatenate,
     last_steps,
     newest_clouds,
+    with_velocity,
 )
 from gsim3d.synth import cameras, render
 from gsim3d.synth.scene_setup import GRAVITY
@@ -211,10 +212,8 @@ class ModelScenes(Scenes):
         moves = (particles.activity == DYNAMIC)[:, None]
         velocity = velocities.float()[scene]
         means = particles.means + torch.where(moves, seconds * (fall * seconds - velocity), 0)
-        fields = {"means": means}
-        if particles.velocity is not None:
-            fields["velocity"] = torch.where(moves, (velocity - fall / FPS) / FPS, particles.velocity)
-        self.state = dataclasses.replace(self.state, particles=dataclasses.replace(particles, **fields))
+        particles = with_velocity(dataclasses.replace(particles, means=means), moves, (velocity - fall / FPS) / FPS)
+        self.state = dataclasses.replace(self.state, particles=particles)
 
     def actors(self) -> Tensor:
         return self.state.actors[:, -1]

@@ -11,7 +11,7 @@ from gsim3d.priors.movable import Windows
 from gsim3d.priors.padding import PaddedClouds, Samples, Subset, mean_shift
 from gsim3d.state import Particles, constant
 
-SMOOTHING = 0.5  # of the displacement before in the velocity, so that it is as old as that of four encoded clouds
+SMOOTHING = 0.5  # share of the old mean velocity in the new one
 
 
 @dataclass(frozen=True)
@@ -30,56 +30,66 @@ class VelocityConfig(PriorConfig):
 
 
 class Velocity(Prior, config=VelocityConfig):
-    """Feature of the newest particles: their velocity v. Predicted gains g [3] add g v (elementwise) to a displacement.
+    """Features of the newest particles: the last displacement v_1 and the mean velocity v_2. Predicted gains g [2, 3]
+    add g_1 v_1 + g_2 v_2 (elementwise) to a displacement.
 
-    The network rounds positions to cells, and so does not see motions below a cell. v is the slope of the line through
-    the means of a particle's window in the clouds of an encoded history; each step with displacement d changes it to
-    (v + d) / 2. With four encoded clouds both are mean velocities 1.5 steps before the newest position. Gradients flow
-    through displacements, not through encoded velocities.
+    The network rounds positions to cells, and so does not see motions below a cell. In encoded clouds v_1 is the
+    displacement of the mean of a particle's window since the cloud before, and v_2 the slope of the line through the
+    means in all clouds of the history, which has less noise. A step with displacement d changes v_2 to (v_2 + d) / 2,
+    so that it lags behind by 1.5 steps, as that of four encoded clouds. Gradients flow through displacements, not
+    through encoded velocities.
     """
 
-    attributes = ("velocity",)
-    n_features = n_gains = 3
+    attributes = ("velocity", "mean_velocity")
+    n_features = n_gains = 6
     is_local = True
 
     def initialize(self, particles: Particles, ctx: StepContext, frames: Frames | None = None) -> Particles:
         if frames is None or ctx.is_empty:
             return particles
-        return replace(particles, velocity=ctx.scatter_newest(window_velocity(ctx, self.config.radius)))
+        last, mean = map(ctx.scatter_newest, window_velocities(ctx, self.config.radius))
+        return replace(particles, velocity=last, mean_velocity=mean)
 
     def features(self, ctx: StepContext) -> Tensor:
-        return ctx.scatter_newest(ctx.state.velocity) / ctx.grid_size
+        return ctx.scatter_newest(torch.cat([ctx.state.velocity, ctx.state.mean_velocity], 1)) / ctx.grid_size
 
     def move(self, motion: Motion, gains: Tensor, ctx: StepContext) -> Motion:
-        return replace(motion, gained=motion.gained + bounded_gains(gains)[:, 0] * ctx.state.velocity)
+        velocities = torch.stack([ctx.state.velocity, ctx.state.mean_velocity], 1)
+        return replace(motion, gained=motion.gained + (bounded_gains(gains) * velocities).sum(1))
 
     def finish(self, step: Particles, gains: Tensor, ctx: StepContext) -> Particles:
         moved = step.means - ctx.state.means
-        return replace(step, velocity=torch.lerp(moved, ctx.state.velocity, SMOOTHING))
+        return replace(step, velocity=moved, mean_velocity=torch.lerp(moved, ctx.state.mean_velocity, SMOOTHING))
 
 
 @torch.no_grad()
-def window_velocity(ctx: StepContext, radius: float) -> Tensor:
-    """Velocity [N, 3] in m/step of the newest particles: the slope of the line through the means of their window over
-    the history, by least squares; 0 of particles that cannot move, and in scenes with a single step."""
+def window_velocities(ctx: StepContext, radius: float) -> tuple[Tensor, Tensor]:
+    """Last displacement and mean velocity [N, 3] in m/step of the newest particles, see :class:`Velocity`; 0 of
+    particles that cannot move, and in scenes with a single step."""
     particles, steps = ctx.history, ctx.history.clouds.steps
-    begins = [0, *(q + 1 for q in ctx.newest[:-1])]
-    older = [[f for f in range(b, q) if steps[q] - steps[f] < ctx.max_steps] for b, q in zip(begins, ctx.newest)]
-    slopes = [slope_weights([steps[q] - steps[f] for f in some]) for some, q in zip(older, ctx.newest)]
+    ends = zip([0, *(q + 1 for q in ctx.newest[:-1])], ctx.newest)
+    older = [[f for f in range(q - 1, b - 1, -1) if steps[q] - steps[f] < ctx.max_steps] for b, q in ends]
+    ages = [[steps[q] - steps[f] for f in some] for some, q in zip(older, ctx.newest)]
+    slopes = [slope_weights(some) for some in ages]
     with torch.autocast(particles.means.device.type, enabled=False):
         movable = ctx.movable
         windows, now = Windows(movable, particles, radius, evenly=False), movable.samples
-        velocity = torch.zeros_like(windows.nodes)
-        divisors = constant(tuple(divisor for _, divisor in slopes), velocity.device)
-        for number in range(max(map(len, older))):
-            chosen = [some[number] if number < len(some) else q for some, q in zip(older, ctx.newest)]
+        last = mean = torch.zeros_like(windows.nodes)
+
+        def of_scenes(values: list[int]) -> Tensor:
+            return constant(tuple(values), last.device).to(last)[:, None, None]
+
+        for number in range(max(map(len, older))):  # from the cloud before the newest on
+            chosen = [(*some, *[q] * (number + 1))[number] for some, q in zip(older, ctx.newest)]
             then = Samples(Subset(PaddedClouds(particles, chosen, ctx.grid_size), particles))
             then.center(movable.center)
-            weights = constant(tuple(some[number] if number < len(some) else 0 for some, _ in slopes), velocity.device)
-            weights = torch.where((now.n > 0) & (then.n > 0), weights, 0) / divisors
-            moved = mean_shift(now, then, windows.nodes, radius)
-            velocity = velocity + weights.to(moved)[:, None, None] * moved
-        return movable.scatter(*windows.to_particles(velocity))
+            known = ((now.n > 0) & (then.n > 0))[:, None, None]
+            moved = torch.where(known, mean_shift(now, then, windows.nodes, radius), 0)
+            weights = of_scenes([(*some, *[0] * (number + 1))[number] for some, _ in slopes])
+            mean = mean + moved * weights / of_scenes([divisor for _, divisor in slopes])
+            if number == 0:
+                last = moved / of_scenes([(*some, 1)[0] for some in ages])
+        return tuple(map(movable.scatter, windows.to_particles(last, mean)))
 
 
 def slope_weights(ages: list[int]) -> tuple[list[int], int]:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gsim3d.priors import Motion, VelocityConfig
-from gsim3d.priors.velocity import slope_weights, window_velocity
+from gsim3d.priors.velocity import slope_weights, window_velocities
 from gsim3d.state import DYNAMIC, FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import TINY, batch, make_dynamics, make_history
@@ -37,13 +37,19 @@ def _even(n, g):
 
 
 def of(history, radius=RADIUS):
-    return window_velocity(context(history, grid_size=CELL), radius)
+    """Mean velocities."""
+    return both_of(history, radius)[1]
+
+
+def both_of(history, radius=RADIUS):
+    return window_velocities(context(history, grid_size=CELL), radius)
 
 
 def moving(value=0.004, **options):
     """A history whose particles have a velocity."""
     history = make_history(**options)
-    return dataclasses.replace(history, velocity=torch.full_like(history.means, value))
+    velocities = {name: torch.full_like(history.means, value) for name in ("velocity", "mean_velocity")}
+    return dataclasses.replace(history, **velocities)
 
 
 def newest(history):
@@ -78,23 +84,37 @@ def test_windows_follow_bodies_apart():
     assert (found[n[-1] :] + torch.tensor([0.0, 0.01, 0.0])).abs().max() < 2e-3
 
 
-def test_slope_is_less_noisy_than_the_last_difference():
-    errors = []
+def test_slope_is_less_noisy_than_the_last_displacement():
+    errors, true = [], torch.tensor([0.004, -0.003, 0.001])
     for seed in range(20):
         history = flown(seed=seed, noise=0.001)
+        last, mean = both_of(history, radius=10.0)
         means = [part.mean(0) for part in history.means.split([300, 340, 280, 310])]
-        true = torch.tensor([0.004, -0.003, 0.001])
-        errors.append(torch.stack([of(history, radius=10.0)[0] - true, means[3] - means[2] - true]).norm(dim=1))
-    slope, last = torch.stack(errors).square().mean(0).sqrt()
-    assert slope < 0.5 * last
+        assert torch.allclose(last, means[3] - means[2], atol=1e-5)
+        errors.append(torch.stack([mean[0] - true, last[0] - true]).norm(dim=1))
+    slope, difference = torch.stack(errors).square().mean(0).sqrt()
+    assert slope < 0.5 * difference
+
+
+def test_ages_of_clouds_count():
+    """Clouds of steps 0, 2 and 3: the last displacement is that of one step, the line is that of time."""
+    history = flown((200, 210, 220))
+    history = dataclasses.replace(history, cloud_step=torch.tensor([0, 2, 3]))
+    parts, v = history.means.split([200, 210, 220]), torch.tensor([0.004, -0.003, 0.001])
+    history = dataclasses.replace(history, means=torch.cat([parts[0], parts[1] + v, parts[2] + v]))
+    last, mean = both_of(history, radius=10.0)
+    assert (last - v).abs().max() < 1e-5 and (mean - v).abs().max() < 1e-5
+    early = history.select_clouds(torch.tensor([0, 1]))
+    last, mean = both_of(early, radius=10.0)
+    assert (last - v).abs().max() < 1e-5 and (mean - v).abs().max() < 1e-5
 
 
 @pytest.mark.parametrize("counts", [(0, 0, 0, 200), (200,), (0, 200, 0, 210), (200, 190, 0, 0)])
 def test_missing_clouds(counts):
-    found = of(flown(counts)) if counts[-1] else of(flown(counts)).reshape(-1, 3)
-    assert found.isfinite().all() and found.shape == (counts[-1], 3)
-    if sum(n > 0 for n in counts) < 2:
-        assert not found.any()
+    for found in both_of(flown(counts)):
+        assert found.isfinite().all() and found.shape == (counts[-1], 3)
+        if sum(n > 0 for n in counts) < 2:
+            assert not found.any()
 
 
 def test_frozen_particles_and_older_clouds_have_none():
@@ -104,10 +124,12 @@ def test_frozen_particles_and_older_clouds_have_none():
     history = dataclasses.replace(history, activity=activity)
     ctx = context(history, VelocityConfig(), grid_size=CELL)
     prior = ctx.priors.get("velocity")
-    velocity = prior.initialize(ctx.history, ctx, FRAMES).velocity
-    assert not velocity[-50:].any() and velocity[-310:-50].any(1).all() and not velocity[:-310].any()
+    begun = prior.initialize(ctx.history, ctx, FRAMES)
+    for velocity in (begun.velocity, begun.mean_velocity):
+        assert not velocity[-50:].any() and velocity[-310:-50].any(1).all() and not velocity[:-310].any()
     assert prior.initialize(ctx.history, ctx) is ctx.history  # edits keep velocities
-    assert_same_bits(prior.features(ctx), ctx.history.velocity / CELL)
+    ctx = context(begun, VelocityConfig(), grid_size=CELL)
+    assert_same_bits(prior.features(ctx), torch.cat([begun.velocity, begun.mean_velocity], 1) / CELL)
 
 
 def test_scenes_are_independent():
@@ -129,17 +151,18 @@ def test_gains_carry_velocities_on():
     history = moving(0.004, frozen_share=0.0)
     ctx = context(history, VelocityConfig(), grid_size=CELL)
     prior, n = ctx.priors.get("velocity"), len(newest(history))
-    gains = 2 * torch.atanh(torch.tensor([0.5, 0.0, -0.25])).expand(n, 3)
+    gains = 2 * torch.atanh(torch.tensor([0.5, 0.0, -0.25, 0.25, 0.5, 0.0])).expand(n, 6)
     motion = prior.move(Motion.of_network(torch.zeros(n, 3)), gains, ctx)
-    assert_close_relative_to_max(motion.total(), torch.tensor([0.004, 0.0, -0.002]).expand(n, 3), 1e-5)
+    assert_close_relative_to_max(motion.total(), torch.tensor([0.006, 0.004, -0.002]).expand(n, 3), 1e-5)
 
 
-def test_a_step_halves_the_old_velocity():
+def test_a_step_holds_its_displacement_and_halves_the_old_mean():
     history = moving(0.004)
     step = make_dynamics(MOVING)(history)
     moved = step.means - newest(history)
     assert moved.abs().max() > 0
-    assert_close_relative_to_max(step.velocity, (moved + 0.004) / 2, 1e-6)
+    assert_same_bits(step.velocity, moved)
+    assert_close_relative_to_max(step.mean_velocity, (moved + 0.004) / 2, 1e-6)
 
 
 def test_velocity_of_a_steady_fall_does_not_jump_at_the_first_step():
@@ -155,15 +178,20 @@ def test_velocity_of_a_steady_fall_does_not_jump_at_the_first_step():
 
 def test_gradients_flow_through_displacements_only():
     dynamics, history = make_dynamics(MOVING), moving()
-    torch.nn.init.constant_(dynamics.priors.get("velocity").gain_head.bias, 1.0)
+    torch.nn.init.constant_(dynamics.priors.get("velocity").gain_head.bias, 0.5)
+    for parameter in dynamics.net.head.parameters():
+        torch.nn.init.zeros_(parameter)  # else some displacements are at their limit
     start = dynamics(history)
-    velocity = start.velocity.detach().requires_grad_()
-    later = dynamics(dynamics(dataclasses.replace(start, velocity=velocity)))
-    (gradient,) = torch.autograd.grad(later.means.sum(), velocity)
-    gain = 2 * torch.tanh(torch.tensor(0.5))
+    velocity, mean = (value.detach().requires_grad_() for value in (start.velocity, start.mean_velocity))
+    later = dynamics(dynamics(dataclasses.replace(start, velocity=velocity, mean_velocity=mean)))
+    gradients = torch.autograd.grad(later.means.sum(), [velocity, mean])
+    gain = 2 * torch.tanh(torch.tensor(0.25))
     moves = (start.activity == DYNAMIC)[:, None].expand(-1, 3)
-    assert_close_relative_to_max(gradient[moves], (gain + gain * (1 + gain) / 2).expand(int(moves.sum())), 1e-5)
-    assert not gradient[~moves].any()
+    # The first step adds g (v_1 + v_2) = d, the second g (d + (v_2 + d) / 2).
+    for gradient, more in zip(gradients, (0, gain / 2), strict=True):
+        wanted = gain + gain * gain * 1.5 + more
+        assert_close_relative_to_max(gradient[moves], wanted.expand(int(moves.sum())), 1e-5)
+        assert not gradient[~moves].any()
     history = flown()
     assert not of(dataclasses.replace(history, means=history.means.requires_grad_())).requires_grad
 

@@ -99,7 +99,7 @@ def test_states_and_images_stay_float32(folder, tmp_path, precision, device):
     trainer = trainer_at(folder, tmp_path, device=device, precision=precision)
     render, seen = trainer.simulator.render, []
     trainer.simulator.render = lambda p, *given, **options: seen.append(p) or render(p, *given, **options)
-    images = trainer._images(trainer._batch([0]), 0, StepWatch())
+    images, _ = trainer._images(trainer._batch([0]), 0, StepWatch())
     (particles,) = seen
     floats = [value for value in particles.row_fields().values() if value.is_floating_point()]
     assert len(floats) == 4 and particles.n_clouds == 4
@@ -330,7 +330,7 @@ def test_cut_bounds_steps_of_gradients(folder, tmp_path):
         phase = dataclasses.replace(CONFIG.phases[1], horizon=4, cut=cut, from_start=1.0)
         batch, watch = draw_batch(trainer.scenes, CONFIG.data, phase, 0, LATER, [0]), StepWatch()
         trainer.step = 0  # one that is logged
-        images = trainer._images(batch, 0, watch)
+        images, _ = trainer._images(batch, 0, watch)
         errors = (images - batch.targets.images.permute(0, 2, 3, 1)).square()
         errors[batch.targets.cameras.image_cloud == batch.n_context + 3].mean().backward()
         reached[cut] = [norm > 0 for norm in watch.norms()]
@@ -352,7 +352,10 @@ def test_bodies_alone_hold_particles_that_the_background_hides(folder, tmp_path)
     means[frozen] = wall
     opacities = torch.full_like(state.opacities, 0.999).requires_grad_()
     state = dataclasses.replace(state, means=means, opacities=opacities)
-    render = lambda p, cameras, valid: trainer.simulator.render(p, cameras, plan=trainer.plan, active=valid).color  # noqa: E731
+
+    def render(particles, cameras, valid):
+        return trainer.simulator.render(particles, cameras, plan=trainer.plan, active=valid).color
+
     whole, alone = render(state, frames.cameras, None), draw_alone(render, state, frames)
     gradients = [torch.autograd.grad(images[0].sum(), opacities, retain_graph=True)[0] for images in (whole, alone)]
     assert gradients[1][row].abs() > 100 * gradients[0][row].abs()
