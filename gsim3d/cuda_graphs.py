@@ -35,7 +35,7 @@ from gsim3d.state import DYNAMIC, Actions, CloudTable, Particles, keeping_consta
 FACTOR = 1.25  # capacity over the observed size
 ROUNDED_PARTS = "dynamics", "renderer"  # modules whose weights are cast for autocast
 # Substrings of out-of-memory messages of torch and of ops.
-OUT_OF_MEMORY = "out of memory", "DefaultCPUAllocator", "STATUS_ALLOC_FAILED", "aten::new_empty"
+OUT_OF_MEMORY = "out of memory", "DefaultCPUAllocator", "STATUS_ALLOC_FAILED", "aoti_torch_empty_strided"
 
 
 class Captured:

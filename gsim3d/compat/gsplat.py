@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gsim3d.cameras import Cameras
 from gsim3d.errors import InputError, check_one_of
-from gsim3d.ops._arguments import check_tensors, check_whole
+from gsim3d.ops._arguments import check_tensors, check_whole, constant
 from gsim3d.ops.projection import Projection, project_gaussians, sh_to_color
 from gsim3d.ops.raster import Rendering
 from gsim3d.ops.raster_projected import rasterize_projected
@@ -145,8 +145,8 @@ def rasterization(
     antialiased = rasterize_mode == "antialiased"
 
     lens, distortion = _lens(LENSES[camera_model], radial_coeffs, tangential_coeffs, n_images)
-    no_plane, owners = means.new_empty(n_images), torch.empty(n_images, dtype=torch.int64, device=means.device)
-    cameras = Cameras(viewmats.flatten(0, -3), Ks.flatten(0, -3), no_plane, no_plane, owners, width, height)
+    unread = constant(torch.arange, n_images, device=means.device)  # planes and clouds
+    cameras = Cameras(viewmats.flatten(0, -3), Ks.flatten(0, -3), unread, unread, unread, width, height)
     shapes = (None, None) if covars is not None else (quats.flatten(0, -2), scales.flatten(0, -2))
     limits = {"near_plane": near_plane, "far_plane": far_plane, "radius_clip": radius_clip, "dilation": eps2d}
     options = {"lens": lens, "distortion": distortion, "jacobian": "clamped", "antialiased": antialiased, **limits}
@@ -205,8 +205,9 @@ def _check(camera_model: str, means, viewmats, Ks, opacities, optional: dict[str
     channels = given.get("colors", means).shape[-1]
     of_cameras = {"backgrounds": channels, "radial_coeffs": n_radial, "tangential_coeffs": 2}
     shapes |= {name: (n_cameras, size) for name, size in of_cameras.items() if name in given}
+    tensors |= optional
     for name, shape in shapes.items():
-        value = (tensors | optional)[name]
+        value = tensors[name]
         if value is None or value.shape != (*batch, *shape):
             got = None if value is None else list(value.shape)
             raise ValueError(f"rasterization: {name} must be {[*batch, *shape]}; got {got}")
@@ -279,11 +280,12 @@ def _absolute(means2d: Tensor) -> Tensor:
 
 def _images(image: Rendering, render_mode: str, sizes: tuple[int, ...]) -> tuple[Tensor, Tensor]:
     """Colour with depth as the last channel, and alpha."""
-    alpha, depth = image.alpha[..., None], image.depth[..., None]
-    if render_mode.endswith("ED"):
-        depth = depth / alpha.clamp_min(1e-10)
-    parts = {"RGB": [image.color], "D": [depth], "ED": [depth]}.get(render_mode, [image.color, depth])
-    color = torch.cat(parts, -1) if len(parts) > 1 else parts[0]
+    color, alpha = image.color, image.alpha[..., None]
+    if render_mode != "RGB":
+        depth = image.depth[..., None]
+        if render_mode.endswith("ED"):
+            depth = depth / alpha.clamp_min(1e-10)
+        color = torch.cat([color, depth], -1) if "RGB" in render_mode else depth
     if len(sizes) == 1:
         return color, alpha
     return color.unflatten(0, sizes), alpha.unflatten(0, sizes)

@@ -40,13 +40,14 @@ def check_floating(op: str, narrow: dict[str, Tensor | None] | None = None, **fi
     On a GPU, where some ops take half precision, and under autocast, which casts, the op itself looks.
     """
     for name, value in first.items():
-        device, dtype = value.device.type, str(value.dtype).removeprefix("torch.")
-        if device == "cpu" and dtype not in ("float32", "float64") and not torch.is_autocast_enabled("cpu"):
-            raise ValueError(f"{op}: {name} must be float32 or float64; got {dtype}")
+        device, dtype = value.device.type, value.dtype
+        if device == "cpu" and dtype not in (torch.float32, torch.float64) and not torch.is_autocast_enabled("cpu"):
+            raise ValueError(f"{op}: {name} must be float32 or float64; got {str(dtype).removeprefix('torch.')}")
         for other, x in (narrow or {}).items():
-            allowed = x is None or x.dtype in (value.dtype, torch.float16, torch.bfloat16)
+            allowed = x is None or x.dtype in (dtype, torch.float16, torch.bfloat16)
             if not allowed and not torch.is_autocast_enabled(device):
-                raise ValueError(f"{op}: {other} must be {dtype}, as {name}, or of 16 bits; got {x.dtype}")
+                wanted = str(dtype).removeprefix("torch.")
+                raise ValueError(f"{op}: {other} must be {wanted}, as {name}, or of 16 bits; got {x.dtype}")
 
 
 def check_splits(op: str, n: int, **offsets: Tensor | None) -> None:
@@ -78,19 +79,20 @@ def check_numbers(op: str, *, largest_of: float = math.inf, negative: bool = Tru
             _refuse(op, name, value.detach(), largest, least)
 
 
-def index_list(make: Callable[..., Tensor], *sizes: int, device: torch.device) -> Tensor:
-    """``make(*sizes, device=device)``, an index list that must not be modified; kept for later calls, unless they are
-    traced or captured in a graph, whose memory ends with it."""
+def constant(make: Callable[..., Any], *sizes: int, device: torch.device, **options: Any) -> Any:
+    """``make(*sizes, device=device, **options)``, tensors that must not be modified; kept for later calls, unless they
+    are traced or captured in a graph, whose memory ends with it."""
     traced = torch.compiler.is_compiling() or torch._C._len_torch_dispatch_stack() > 0
-    if traced or (device.type == "cuda" and torch.cuda.is_current_stream_capturing()):
-        return make(*sizes, device=device)
-    return _recent(make, sizes, device, torch.cuda.current_stream(device) if device.type == "cuda" else None)
+    if traced or (device.type == "cuda" and torch._C._cuda_isCurrentStreamCapturing()):
+        return make(*sizes, device=device, **options)
+    stream = torch._C._cuda_getCurrentRawStream(device.index) if device.type == "cuda" else None
+    return _recent(stream, make, *sizes, device=device, **options)
 
 
 @functools.lru_cache(maxsize=256)
-def _recent(make: Callable[..., Tensor], sizes: tuple[int, ...], device: torch.device, stream: Any) -> Tensor:
+def _recent(stream: int | None, make: Callable[..., Any], *sizes: int, **options: Any) -> Any:
     with torch.inference_mode(False):
-        return make(*sizes, device=device)
+        return make(*sizes, **options)
 
 
 def offsets(count: int, n: int, *, device: torch.device) -> Tensor:
@@ -133,7 +135,7 @@ def within_memory(op: str, what: str, kernel, *arguments):
     except MemoryError:  # of a list that the kernel makes
         raise MemoryError(f"{op}: there is no memory for the result of {what}") from None
     except RuntimeError as error:
-        if "new_empty" in str(error) and not torch.compiler.is_compiling():  # torch's allocator, which says no more
+        if "aoti_torch_empty_strided" in str(error) and not torch.compiler.is_compiling():  # of torch's allocator
             raise MemoryError(f"{op}: there is no memory for the result of {what}") from None
         raise
 

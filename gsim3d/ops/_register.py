@@ -209,7 +209,7 @@ def _register(name: str, op: str, backward: Callable, setup: Callable | None, wi
                 return overload(*inputs)
             return overload.redispatch(keyset & torch._C._after_autograd_keyset, *inputs)
 
-    class Function(torch.autograd.Function):
+    class Function(torch.autograd.function._SingleLevelFunction):  # transforms of torch.func do not come here
         @staticmethod
         def forward(ctx, *inputs):
             *inputs, keyset = inputs

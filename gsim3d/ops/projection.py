@@ -15,7 +15,7 @@ from gsim3d.ops._arguments import (
     check_real,
     check_splits,
     check_tensors,
-    index_list,
+    constant,
     offsets,
     within_memory,
 )
@@ -129,12 +129,11 @@ def project_gaussians(
     n, n_images, device, image_cloud = means.shape[0], len(cameras), means.device, cameras.image_cloud
     if n_clouds is not None:
         each = n // max(1, n_clouds)
-        image_cloud = index_list(_owners, n_clouds, n_images // max(1, n_clouds), device=device)
-        cu_rows = index_list(offsets, n_clouds, each, device=device)
-        cu_pairs, n_pairs = index_list(offsets, n_images, each, device=device), n_images * each
+        image_cloud, cu_rows, cu_pairs = constant(_lists, n_clouds, n_images // max(1, n_clouds), each, device=device)
+        n_pairs = n_images * each
     else:
         if cu_rows is None:
-            cu_rows = index_list(offsets, 1, n, device=device)
+            cu_rows = constant(offsets, 1, n, device=device)
             n_pairs = n * n_images if n_pairs is None else n_pairs
         counts = F.pad(cu_rows[1:] - cu_rows[:-1], (0, 1))  # a cloud that is none has no rows
         cu_pairs = F.pad(counts[image_cloud.clamp(0, len(counts) - 1)].cumsum(0), (1, 0))
@@ -157,9 +156,11 @@ def project_gaussians(
     return Projection(means2d, conics, depths, radii, compensations, cu_pairs)
 
 
-def _owners(n_clouds: int, n_images: int, *, device: torch.device) -> Tensor:
-    """int64 [n_clouds * n_images], which cloud each image shows."""
-    return torch.arange(n_clouds, device=device).repeat_interleave(n_images, output_size=n_clouds * n_images)
+def _lists(n_clouds: int, n_images: int, n: int, *, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """image_cloud, cu_rows and cu_pairs of clouds of ``n`` rows, each shown by ``n_images``."""
+    total = n_clouds * n_images
+    owners = torch.arange(n_clouds, device=device).repeat_interleave(n_images, output_size=total)
+    return owners, offsets(n_clouds, n, device=device), offsets(total, n, device=device)
 
 
 def lens_limits(lens: str, distortion: Tensor) -> Tensor:
@@ -283,12 +284,9 @@ def _setup(ctx, inputs, output):
 
 def _backward(ctx, means2d, conics, depths, _, compensations):
     saved = ctx.saved_tensors
-    means, n_pairs = saved[1], ctx.options[0]
-    given = zip((means2d, conics, depths, compensations), ((2,), (3,), (), ()))
-    pairs = [means.new_zeros(n_pairs, *size) if grad is None else grad for grad, size in given]
     of_viewmats, of_Ks, of_distortion = ctx.needs_input_grad[5:8]
     options = *ctx.options, of_viewmats, of_Ks or of_distortion
-    grads = call("project_gaussians_backward", *pairs, *saved, *options)
+    grads = call("project_gaussians_backward", means2d, conics, depths, compensations, *saved, *options)
     wanted = (True, *(x is not None for x in saved[2:5]), of_viewmats, of_Ks, of_distortion)
     grads = [grad if want else None for grad, want in zip(grads, wanted, strict=True)]
     return *grads[:4], None, *grads[4:], *[None] * 14  # none of opacities

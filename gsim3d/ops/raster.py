@@ -226,13 +226,14 @@ def check_scene(op: str, tensors: dict[str, Tensor], cameras: Cameras, **sizes: 
     """Types of all arguments, and numbers of dimensions that are read before a kernel checks them."""
     if not isinstance(cameras, Cameras):
         raise TypeError(f"{op}: cameras must be gsim3d.Cameras; got {type(cameras).__name__}")
-    of_cameras = {f"cameras.{name}": getattr(cameras, name) for name in ("viewmats", "Ks", "image_cloud")}
-    check_tensors(op, **tensors, **of_cameras)
+    of_cameras = {"cameras.viewmats": cameras.viewmats, "cameras.Ks": cameras.Ks}
+    tensors = tensors | of_cameras | {"cameras.image_cloud": cameras.image_cloud}
+    check_tensors(op, **tensors)
     check_floating(op, means=tensors["means"])
-    check_whole(op, **sizes, **{f"cameras.{name}": getattr(cameras, name) for name in ("width", "height")})
+    check_whole(op, **sizes, **{"cameras.width": cameras.width, "cameras.height": cameras.height})
     shapes = {"means": "[N, 3]", "cameras.viewmats": "[I, 4, 4]", "cameras.Ks": "[I, 3, 3]", "cu_rows": "[Q + 1]"}
     for name, shape in shapes.items():
-        value = (tensors | of_cameras).get(name)
+        value = tensors.get(name)
         if value is not None and value.dim() != shape.count(",") + 1:
             raise ValueError(f"{op}: {name} must be {shape}; got {list(value.shape)}")
 

@@ -11,12 +11,12 @@ from gsim3d.ops._arguments import (
     check_splits,
     check_tensors,
     check_whole,
-    index_list,
+    constant,
     offsets,
     within_memory,
 )
 from gsim3d.ops._register import call, fakes, register_autocast, register_gradients
-from gsim3d.ops.raster import CUTOFFS, LARGEST, Rendering, empty_images, grads_of_images, sizes_of_state, state_bytes
+from gsim3d.ops.raster import CUTOFFS, LARGEST, Rendering, empty_images, sizes_of_state, state_bytes
 
 OP = "rasterize_projected"
 
@@ -74,15 +74,17 @@ def rasterize_projected(
     _check(rows, {name: value for name, value in optional.items() if value is not None}, width, height, cutoff)
     device = means2d.device
     if cu_pairs is None:
-        cu_pairs = index_list(offsets, 1, means2d.shape[0], device=device)
+        cu_pairs = constant(offsets, 1, means2d.shape[0], device=device)
     n_images, n_channels = cu_pairs.shape[0] - 1, colors.shape[1]
     if background is None:
-        background = means2d.new_zeros(n_images, n_channels)
-    background = background.expand(n_images, n_channels).to(means2d.dtype)
-    color, features = _three_and_more(colors.to(means2d.dtype))
+        background = constant(torch.zeros, n_images, n_channels, device=device, dtype=means2d.dtype)
+    else:
+        background = background.expand(n_images, n_channels).to(means2d.dtype)
+    colors = colors.to(means2d.dtype)
+    features = colors[:, 3:] if n_channels > 3 else colors.new_empty(colors.shape[0], 0)
     args = (
-        *(means2d, conics, depths, opacities, color, features, _three_and_more(background)[0], absolute),
-        *(index_list(torch.arange, n_images, device=device), cu_pairs, width, height, CUTOFFS[cutoff]),
+        *(means2d, conics, depths, opacities, _first_three(colors), features, _first_three(background), absolute),
+        *(constant(torch.arange, n_images, device=device), cu_pairs, width, height, CUTOFFS[cutoff]),
         *sizes_of_state(means2d, n_images, n_images, width, height),
     )
     out = within_memory(OP, f"width={width}, height={height}", call, OP, *args)
@@ -93,12 +95,10 @@ def rasterize_projected(
     return Rendering(color[..., :n_channels] if n_channels < 3 else color, alpha, depth, None)
 
 
-def _three_and_more(channels: Tensor) -> tuple[Tensor, Tensor]:
-    """The first three of [N, D] channels, zeros where there are fewer, and the others; copies nothing of three."""
-    n, d = channels.shape
-    if d <= 3:
-        return channels if d == 3 else F.pad(channels, (0, 3 - d)), channels.new_empty(n, 0)
-    return channels[:, :3], channels[:, 3:]
+def _first_three(channels: Tensor) -> Tensor:
+    """[N, 3] of [N, D], zeros where there are fewer; copies nothing of three."""
+    d = channels.shape[1]
+    return channels if d == 3 else channels[:, :3] if d > 3 else F.pad(channels, (0, 3 - d))
 
 
 def _check(rows: dict[str, Tensor], optional: dict[str, Tensor], width: int, height: int, cutoff: str) -> None:
@@ -132,9 +132,10 @@ def _images(means2d, conics, depths, opacities, color, features, background, abs
 
 
 def _gradients(grad_color, grad_alpha, grad_depth, grad_features, transmittance, last, state, *inputs):
-    *inputs, absolute = inputs
+    *inputs, of_background, absolute = inputs
     shapes = [x.shape for x in inputs[:7]]
     shapes[5] = (shapes[5][0], shapes[5][1] + (2 if absolute else 0))
+    shapes[6] = (shapes[6][0] if of_background else 0, 3)
     return tuple(inputs[0].new_empty(shape) for shape in shapes)
 
 
@@ -149,13 +150,11 @@ def _setup(ctx, inputs, output):
 
 
 def _backward(ctx, *grads):
-    saved, with_absolute = ctx.saved_tensors, ctx.needs_input_grad[7]
-    n_features = saved[8].shape[1]
-    images = grads_of_images(grads, saved[0], n_features)
-    found = call("rasterize_projected_backward", *images, *saved, *ctx.options, with_absolute)
-    *rows, features, background = found
-    absolute = features[:, n_features:] if with_absolute else None
-    return (*rows, features[:, :n_features], background, absolute, *[None] * 8)
+    saved, (of_background, with_absolute) = ctx.saved_tensors, ctx.needs_input_grad[6:8]
+    options = *ctx.options, of_background, with_absolute
+    *rows, features, background = call("rasterize_projected_backward", *grads[:4], *saved, *options)
+    features, absolute = features.tensor_split([saved[8].shape[1]], 1) if with_absolute else (features, None)
+    return (*rows, features, background if of_background else None, absolute, *[None] * 8)
 
 
 register_gradients("rasterize_projected", _backward, _setup, gradient_ops=["rasterize_projected_backward"])

@@ -10,7 +10,7 @@ from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode
 from gsim3d.cameras import Cameras
 from gsim3d.errors import GradientError, NumericalError
 from gsim3d.ops import project_gaussians, rasterize_gaussians, rasterize_projected, sh_to_color
-from gsim3d.ops._arguments import index_list, offsets
+from gsim3d.ops._arguments import constant, offsets
 from gsim3d.ops.projection import lens_limits
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, assert_same_bits_for_any_threads
 from tests.effects.counting import counted
@@ -540,11 +540,11 @@ def test_clouds_that_are_not_of_one_size_raise():
 
 def test_kept_lists_are_those_of_their_sizes():
     device = torch.device("cpu")
-    assert index_list(offsets, 3, 5, device=device).tolist() == [0, 5, 10, 15]
-    assert index_list(offsets, 3, 5, device=device) is index_list(offsets, 3, 5, device=device)
-    assert index_list(offsets, 3, 4, device=device).tolist() == [0, 4, 8, 12]
+    assert constant(offsets, 3, 5, device=device).tolist() == [0, 5, 10, 15]
+    assert constant(offsets, 3, 5, device=device) is constant(offsets, 3, 5, device=device)
+    assert constant(offsets, 3, 4, device=device).tolist() == [0, 4, 8, 12]
     with torch.inference_mode():
-        assert not index_list(offsets, 2, 9, device=device).is_inference()
+        assert not constant(offsets, 2, 9, device=device).is_inference()
     with FakeTensorMode():
-        assert isinstance(index_list(offsets, 6, 7, device=device), FakeTensor)
-    assert not isinstance(index_list(offsets, 6, 7, device=device), FakeTensor)
+        assert isinstance(constant(offsets, 6, 7, device=device), FakeTensor)
+    assert not isinstance(constant(offsets, 6, 7, device=device), FakeTensor)

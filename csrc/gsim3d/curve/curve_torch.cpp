@@ -56,8 +56,7 @@ struct TensorArrays {
 
   static int64_t* append(void* raw, const int64_t* sizes, int64_t dims) {
     auto* self = static_cast<TensorArrays*>(raw);
-    const std::vector<int64_t> shape(sizes, sizes + dims);
-    self->made.push_back(torch::stable::new_empty(self->like, shape, ScalarType::Long));
+    self->made.push_back(empty(self->like, Sizes(sizes, dims), ScalarType::Long));
     return mutable_data<int64_t>(self->made.back());
   }
 };

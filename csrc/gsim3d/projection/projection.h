@@ -63,7 +63,7 @@ struct ProjectionPairs {
 
 template <typename T>
 struct ProjectionPairGrads {
-  const T* means2d;
+  const T* means2d;  // null, like the others but radii: zeros
   const T* conics;
   const T* depths;
   const int32_t* radii;  // values of the forward pass

@@ -27,13 +27,27 @@ __device__ View<T> device_view(const ProjectionScene<T>& s, int64_t image) {
   return view_of(s, image, rows.begin, rows.end);
 }
 
+// A pair that no image has holds zeros.
 template <typename T>
 __global__ void __launch_bounds__(kThreads) project_kernel(ProjectionScene<T> s, ProjectionPairs<T> pairs) {
-  for (int64_t image = blockIdx.y; image < s.n_images; image += gridDim.y) {
-    const View<T> view = device_view(s, image);
-    const int64_t step = int64_t{gridDim.x} * kThreads;
-    for (int64_t row = view.row_begin + int64_t{blockIdx.x} * kThreads + threadIdx.x; row < view.row_end; row += step)
-      write_pair(s, view, row, pairs);
+  const int64_t step = int64_t{gridDim.x} * kThreads;
+  for (int64_t pair = int64_t{blockIdx.x} * kThreads + threadIdx.x; pair < s.n_pairs; pair += step) {
+    int64_t image = 0, end = s.n_images;  // the last image whose pairs begin at or before this one
+    while (end - image > 1) {
+      const int64_t middle = (image + end) / 2;
+      (s.cu_pairs[middle] <= pair ? image : end) = middle;
+    }
+    if (s.n_images > 0) {
+      const View<T> view = device_view(s, image);
+      const int64_t row = view.row_begin + pair - view.pair_begin;
+      if (row >= view.row_begin && row < view.row_end) {
+        write_pair(s, view, row, pairs);
+        continue;
+      }
+    }
+    for (int i = 0; i < 2; ++i) pairs.means2d[2 * pair + i] = 0, pairs.radii[2 * pair + i] = 0;
+    for (int i = 0; i < 3; ++i) pairs.conics[3 * pair + i] = 0;
+    pairs.depths[pair] = 0, pairs.compensations[pair] = 0;
   }
 }
 
@@ -129,12 +143,7 @@ unsigned images_of(int64_t n) { return static_cast<unsigned>(std::min<int64_t>(n
 template <typename T>
 void project_forward(const ProjectionScene<T>& s, const ProjectionPairs<T>& pairs, Stream stream) {
   check_options(s);
-  fill_zero(kProject, pairs.means2d, 2 * s.n_pairs, stream);  // of pairs that no image has
-  fill_zero(kProject, pairs.conics, 3 * s.n_pairs, stream);
-  fill_zero(kProject, pairs.depths, s.n_pairs, stream);
-  fill_zero(kProject, pairs.radii, 2 * s.n_pairs, stream);
-  fill_zero(kProject, pairs.compensations, s.n_pairs, stream);
-  launch(kProject, project_kernel<T>, dim3(blocks_of(s.n_rows), images_of(s.n_images)), kThreads, 0, stream, s, pairs);
+  launch(kProject, project_kernel<T>, blocks_of(s.n_pairs), kThreads, 0, stream, s, pairs);
 }
 
 template <typename T>

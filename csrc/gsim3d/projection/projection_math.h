@@ -365,9 +365,10 @@ GSIM3D_HD void read_pair_vjp(const ProjectionScene<T>& s, const View<T>& view, i
   const int64_t pair = view.pair_begin + row - view.row_begin;
   if (grads.radii[2 * pair] <= 0 || grads.radii[2 * pair + 1] <= 0) return;
   PairGrad<T> grad;
-  for (int i = 0; i < 2; ++i) grad.pixel[i] = grads.means2d[2 * pair + i];
-  for (int i = 0; i < 3; ++i) grad.conic[i] = grads.conics[3 * pair + i];
-  grad.depth = grads.depths[pair], grad.compensation = grads.compensations[pair];
+  for (int i = 0; i < 2; ++i) grad.pixel[i] = raster::value_or_zero(grads.means2d, 2 * pair + i);
+  for (int i = 0; i < 3; ++i) grad.conic[i] = raster::value_or_zero(grads.conics, 3 * pair + i);
+  grad.depth = raster::value_or_zero(grads.depths, pair);
+  grad.compensation = raster::value_or_zero(grads.compensations, pair);
   const T* mean = s.means + 3 * row;
   const Pair<T> p = project_pair(view, mean, shape, s.dilation);
   project_pair_vjp(view, mean, shape, p, grad, to.mean, to.matrix, grad_viewmat, grad_lens);

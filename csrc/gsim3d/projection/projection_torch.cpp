@@ -9,15 +9,6 @@
 namespace gsim3d::binding {
 namespace {
 
-using Optional = std::optional<Tensor>;
-
-Optional rows_of(const Optional& tensor) { return tensor ? Optional(binding::rows_of(*tensor)) : tensor; }
-
-template <typename T>
-const T* data_or_null(const Optional& tensor) {
-  return tensor ? data<T>(*tensor) : nullptr;
-}
-
 // The arguments that forward and backward share, contiguous and checked against each other.
 struct GaussianTensors {
   const char* op;
@@ -34,7 +25,7 @@ struct GaussianTensors {
   GaussianTensors contiguous() const {
     GaussianTensors copy = *this;
     for (Tensor* tensor : {&copy.means, &copy.viewmats, &copy.Ks, &copy.image_cloud, &copy.cu_rows, &copy.cu_pairs})
-      *tensor = binding::rows_of(*tensor);
+      *tensor = rows_of(*tensor);
     for (Optional* tensor : {&copy.quats, &copy.scales, &copy.covars, &copy.opacities, &copy.distortion, &copy.limits})
       *tensor = rows_of(*tensor);
     return copy;
@@ -48,13 +39,14 @@ struct GaussianTensors {
     check_shape(op, "viewmats", viewmats, {-1, 4, 4}, "[I, 4, 4]");
     const int64_t n = n_rows(), images = n_images();
     check(covars.has_value() != (quats.has_value() && scales.has_value()), op, ": give quats and scales, or covars");
-    if (quats) check_shape(op, "quats", *quats, {n, 4}, "[N, 4]");
-    if (scales) check_shape(op, "scales", *scales, {n, 3}, "[N, 3]");
-    if (covars) check_shape(op, "covars", *covars, {n, 3, 3}, "[N, 3, 3]");
-    if (opacities) check_shape(op, "opacities", *opacities, {n}, "[N]");
-    check_shape(op, "Ks", Ks, {images, 3, 3}, "[I, 3, 3]");
-    if (distortion) check_shape(op, "distortion", *distortion, {images, kDistortion}, "[I, 8]");
-    if (limits) check_shape(op, "limits", *limits, {images}, "[I]");
+    check_like(op, "quats", quats, {n, 4}, "[N, 4]", means);
+    check_like(op, "scales", scales, {n, 3}, "[N, 3]", means);
+    check_like(op, "covars", covars, {n, 3, 3}, "[N, 3, 3]", means);
+    check_like(op, "opacities", opacities, {n}, "[N]", means);
+    check_like(op, "viewmats", viewmats, {images, 4, 4}, "[I, 4, 4]", means);
+    check_like(op, "Ks", Ks, {images, 3, 3}, "[I, 3, 3]", means);
+    check_like(op, "distortion", distortion, {images, kDistortion}, "[I, 8]", means);
+    check_like(op, "limits", limits, {images}, "[I]", means);
     check_shape(op, "image_cloud", image_cloud, {images}, "[I]");
     check_shape(op, "cu_pairs", cu_pairs, {images + 1}, "[I + 1]");
     check(cu_rows.dim() == 1 && cu_rows.size(0) >= 1, op, ": cu_rows must be [Q + 1]; got ", shape_of(cu_rows));
@@ -64,14 +56,6 @@ struct GaussianTensors {
       check_dtype(op, name, tensor, ScalarType::Long);
       check_device(op, name, tensor, means);
     }
-    const auto check_like = [&](const char* name, const Optional& tensor) {
-      if (!tensor) return;
-      check_dtype(op, name, *tensor, means.scalar_type());
-      check_device(op, name, *tensor, means);
-    };
-    check_like("quats", quats), check_like("scales", scales), check_like("covars", covars);
-    check_like("opacities", opacities), check_like("viewmats", viewmats), check_like("Ks", Ks);
-    check_like("distortion", distortion), check_like("limits", limits);
   }
 
   template <typename T>
@@ -136,8 +120,8 @@ Pairs project_gaussians(const Tensor& means, const Optional& quats, const Option
 using GaussianGrads = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 GaussianGrads project_gaussians_backward(
-    const Tensor& grad_means2d_, const Tensor& grad_conics_, const Tensor& grad_depths_,
-    const Tensor& grad_compensations_, const Tensor& radii_, const Tensor& means, const Optional& quats,
+    const Optional& grad_means2d_, const Optional& grad_conics_, const Optional& grad_depths_,
+    const Optional& grad_compensations_, const Tensor& radii_, const Tensor& means, const Optional& quats,
     const Optional& scales, const Optional& covars, const Tensor& viewmats, const Tensor& Ks,
     const Optional& distortion, const Tensor& image_cloud, const Tensor& cu_rows, const Tensor& cu_pairs,
     int64_t n_pairs, int64_t width, int64_t height, double dilation, int64_t lens, bool clamped, bool viewmats_grad,
@@ -148,19 +132,16 @@ GaussianGrads project_gaussians_backward(
                               0.0,      1.0,      0.0,    dilation, lens, clamped,      false};
   given.check_all();
   const GaussianTensors in = given.contiguous();
-  const Tensor grad_means2d = binding::rows_of(grad_means2d_), grad_conics = binding::rows_of(grad_conics_);
-  const Tensor grad_depths = binding::rows_of(grad_depths_), radii = binding::rows_of(radii_);
-  const Tensor grad_compensations = binding::rows_of(grad_compensations_);
-  check_shape(op, "grad_means2d", grad_means2d, {n_pairs, 2}, "[P, 2]");
-  check_shape(op, "grad_conics", grad_conics, {n_pairs, 3}, "[P, 3]");
-  check_shape(op, "grad_depths", grad_depths, {n_pairs}, "[P]");
-  check_shape(op, "grad_compensations", grad_compensations, {n_pairs}, "[P]");
+  const Optional grad_means2d = rows_of(grad_means2d_), grad_conics = rows_of(grad_conics_);
+  const Optional grad_depths = rows_of(grad_depths_), grad_compensations = rows_of(grad_compensations_);
+  const Tensor radii = rows_of(radii_);
   check_shape(op, "radii", radii, {n_pairs, 2}, "[P, 2]");
   check_dtype(op, "radii", radii, ScalarType::Int);
-  for (const Tensor* tensor : {&grad_means2d, &grad_conics, &grad_depths, &grad_compensations})
-    check_dtype(op, "gradients of pairs", *tensor, in.means.scalar_type());
-  for (const Tensor* tensor : {&grad_means2d, &grad_conics, &grad_depths, &grad_compensations, &radii})
-    check_device(op, "gradients of pairs", *tensor, in.means);
+  check_device(op, "radii", radii, in.means);
+  check_like(op, "grad_means2d", grad_means2d, {n_pairs, 2}, "[P, 2]", in.means);
+  check_like(op, "grad_conics", grad_conics, {n_pairs, 3}, "[P, 3]", in.means);
+  check_like(op, "grad_depths", grad_depths, {n_pairs}, "[P]", in.means);
+  check_like(op, "grad_compensations", grad_compensations, {n_pairs}, "[P]", in.means);
 
   const int64_t n = in.n_rows(), images = in.n_images(), by_axes = in.quats ? n : 0;
   Tensor grad_means = empty(in.means, {n, 3}), grad_quats = empty(in.means, {by_axes, 4});
@@ -170,8 +151,9 @@ GaussianGrads project_gaussians_backward(
   Tensor grad_distortion = empty(in.means, {lens_grad && in.distortion ? images : 0, kDistortion});
   TensorWorkspace workspace(in.means);
   dispatch_float(op, "means", in.means, [&]<typename T>() {
-    const ProjectionPairGrads<T> pair_grads{data<T>(grad_means2d), data<T>(grad_conics), data<T>(grad_depths),
-                                            data<int32_t>(radii), data<T>(grad_compensations)};
+    const ProjectionPairGrads<T> pair_grads{
+        data_or_null<T>(grad_means2d), data_or_null<T>(grad_conics), data_or_null<T>(grad_depths), data<int32_t>(radii),
+        data_or_null<T>(grad_compensations)};
     const auto wanted = [](bool is, Tensor& tensor) { return is ? mutable_data<T>(tensor) : nullptr; };
     const ProjectionSceneGrads<T> grads{mutable_data<T>(grad_means),
                                         wanted(in.quats.has_value(), grad_quats),
@@ -199,7 +181,7 @@ ShSizes check_sh(const char* op, const Tensor& directions, const Tensor& sh) {
 Tensor sh_to_color(const Tensor& directions_, const Tensor& sh_) {
   const char* op = "sh_to_color";
   const ShSizes sizes = check_sh(op, directions_, sh_);
-  const Tensor directions = binding::rows_of(directions_), sh = binding::rows_of(sh_);
+  const Tensor directions = rows_of(directions_), sh = rows_of(sh_);
   Tensor color = empty(directions, {sizes.n_batches, sizes.n_views, sizes.n_rows, sizes.n_channels});
   dispatch_float(op, "directions", directions, [&]<typename T>() {
     if constexpr (kWithCuda)
@@ -214,12 +196,11 @@ Tensor sh_to_color(const Tensor& directions_, const Tensor& sh_) {
 std::tuple<Tensor, Tensor> sh_to_color_backward(const Tensor& grad_, const Tensor& directions_, const Tensor& sh_) {
   const char* op = "sh_to_color_backward";
   const ShSizes sizes = check_sh(op, directions_, sh_);
-  const Tensor grad = binding::rows_of(grad_), directions = binding::rows_of(directions_), sh = binding::rows_of(sh_);
+  const Tensor grad = rows_of(grad_), directions = rows_of(directions_), sh = rows_of(sh_);
   check_shape(op, "grad", grad, {sizes.n_batches, sizes.n_views, sizes.n_rows, sizes.n_channels}, "[B, V, N, D]");
   check_dtype(op, "grad", grad, directions.scalar_type());
   check_device(op, "grad", grad, directions);
-  Tensor grad_directions = torch::stable::new_empty(directions, directions.sizes());
-  Tensor grad_sh = torch::stable::new_empty(sh, sh.sizes());
+  Tensor grad_directions = empty(directions, directions.sizes()), grad_sh = empty(sh, sh.sizes());
   dispatch_float(op, "directions", directions, [&]<typename T>() {
     if constexpr (kWithCuda)
       if (directions.is_cuda())

@@ -100,7 +100,7 @@ struct RasterImages {
 
 template <typename T>
 struct RasterImageGrads {
-  const T* color;
+  const T* color;  // null, like the next three: zeros; not for second derivatives
   const T* alpha;
   const T* depth;
   const T* features;
@@ -116,7 +116,7 @@ struct RasterSceneGrads {
   T* opacities;
   T* color;
   T* features;  // [n_rows, n_features], or with `absolute` two more columns
-  T* background;
+  T* background;  // null: not wanted
   T* viewmats;  // of the 12 upper entries taken as free numbers, the last row is 0; null: not wanted
   // Of projected rows.
   T* means2d = nullptr;

@@ -125,7 +125,8 @@ void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& ima
     launch(kRaster, gather_rows_kernel<T, kTerms>, grid_of_chunks(scene), kBlock, 2 * kRowBytes<T, kTerms>, stream,
            job, slots, grads);
   });
-  launch(kRaster, gather_images_kernel<T>, grid_for(scene.n_images, 1), kOneBlock, 0, stream, job, slots, grads);
+  if (grads.background || viewmats)
+    launch(kRaster, gather_images_kernel<T>, grid_for(scene.n_images, 1), kOneBlock, 0, stream, job, slots, grads);
   const auto rest = [&](auto fade) {
     launch_together(further_vjp_kernel<T, decltype(fade)::value>,
                     std::max({kWarps * sizeof(BlendGradShared<T, true>), kSortBytes<T, kBlock>,

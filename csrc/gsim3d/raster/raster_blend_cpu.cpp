@@ -221,15 +221,16 @@ void blend_tile_vjp(const RasterScene<T>& scene, const Group<T>& group, const Ra
     light_behind[pixel] = rest;
     last[pixel] = grads.last[from];
     n_used = std::max<int64_t>(n_used, grads.last[from]);
-    T seen = -grads.alpha[from];
+    T seen = -value_or_zero(grads.alpha, from);
     for (int c = 0; c < 3; ++c) {
-      grad[c][pixel] = grads.color[3 * from + c];
+      grad[c][pixel] = value_or_zero(grads.color, 3 * from + c);
       seen += grad[c][pixel] * background[c];
       background_sum[c] += grad[c][pixel] * rest;
     }
-    grad[3][pixel] = grads.depth[from];
+    grad[3][pixel] = value_or_zero(grads.depth, from);
     behind[pixel] = rest * seen;
-    for (int64_t c = 0; c < n_features; ++c) feature_grad[c * kPixels + pixel] = grads.features[from * n_features + c];
+    for (int64_t c = 0; c < n_features; ++c)
+      feature_grad[c * kPixels + pixel] = value_or_zero(grads.features, from * n_features + c);
   });
   std::copy_n(background_sum, 3, tile_background);
   n_used = std::min(n_used, tile.n);
@@ -324,7 +325,7 @@ void blend_group_vjp(const RasterScene<T>& scene, const Group<T>& group, const R
     const auto with = [&](auto fade) { absolute ? blend(fade, std::true_type{}) : blend(fade, std::false_type{}); };
     scene.cutoff == RasterCutoff::kSmooth ? with(std::true_type{}) : with(std::false_type{});
   });
-  for (int64_t task = 0; task < n; ++task) {
+  for (int64_t task = 0; task < n && grad_background; ++task) {
     T* grad = grad_background + 3 * (group.first + task / n_tiles);
     for (int c = 0; c < 3; ++c) grad[c] += tile_background[3 * task + c];
   }

@@ -89,7 +89,8 @@ __device__ void dot_features(const RasterScene<T>& s, const RasterImageGrads<T>&
     T g[kFeatures];
     __syncwarp();
     for (int c = 0; c < kFeatures; ++c) {
-      g[c] = pixel >= 0 && c < n_channels ? grads.features[pixel * s.n_features + channel + c] : T(0);
+      const bool is = pixel >= 0 && c < n_channels;
+      g[c] = is ? value_or_zero(grads.features, pixel * s.n_features + channel + c) : T(0);
       shared.features[c][lane] = entry_features && c < n_channels ? entry_features[channel + c] : T(0);
     }
     __syncwarp();
@@ -109,7 +110,7 @@ __device__ void sum_features(const RasterScene<T>& s, const RasterImageGrads<T>&
     __syncwarp();
     for (int c = 0; c < kFeatures; ++c)
       shared.grad_features[c][lane] =
-          pixel >= 0 && c < n_channels ? grads.features[pixel * s.n_features + channel + c] : T(0);
+          pixel >= 0 && c < n_channels ? value_or_zero(grads.features, pixel * s.n_features + channel + c) : T(0);
     __syncwarp();
     if (!slot) continue;
     T sums[kFeatures] = {};
@@ -145,13 +146,13 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
     if (pixel >= 0) {
       at.light = grads.transmittance[pixel];
       at.last = min(grads.last[pixel], quarter.n);
-      T seen = -grads.alpha[pixel];
+      T seen = -value_or_zero(grads.alpha, pixel);
       for (int c = 0; c < 3; ++c) {
-        g[c] = grads.color[3 * pixel + c];
+        g[c] = value_or_zero(grads.color, 3 * pixel + c);
         seen += g[c] * background_of(s, quarter.image, c);
         background_sums[c] += g[c] * at.light;
       }
-      g[3] = grads.depth[pixel];
+      g[3] = value_or_zero(grads.depth, pixel);
       at.sum = at.light * seen;
     }
     for (int c = 0; c < 4; ++c) shared.grad[half * kWarp + lane].value[c] = g[c];

@@ -54,7 +54,7 @@ void clear_grads(const RasterScene<T>& scene, const RasterSceneGrads<T>& grads) 
   std::fill_n(grads.opacities, n, T(0));
   std::fill_n(grads.color, n * std::max<int64_t>(1, scene.sh_terms) * 3, T(0));
   std::fill_n(grads.features, n * n_columns, T(0));
-  std::fill_n(grads.background, scene.n_images * 3, T(0));
+  if (grads.background) std::fill_n(grads.background, scene.n_images * 3, T(0));
   if (grads.viewmats) std::fill_n(grads.viewmats, scene.n_images * 16, T(0));
 }
 

@@ -274,7 +274,7 @@ __device__ void gather_images(const Job<T>& job, const Slots<T>& slots, const Ra
     for (int64_t i = threadIdx.x; i < n; i += blockDim.x)
       for (int c = 0; c < 3; ++c) sums[c] += slots.backgrounds[3 * (image * n + i) + c];
     reduce_block(sums, shared);
-    if (threadIdx.x == 0)
+    if (threadIdx.x == 0 && grads.background)
       for (int c = 0; c < 3; ++c)
         grads.background[3 * image + c] = usable(job.scene.background[3 * image + c]) ? sums[c] : T(0);
     if (slots.viewmats == nullptr || threadIdx.x >= 16) continue;

@@ -8,6 +8,8 @@
 #include <cooperative_groups.h>
 
 #include <algorithm>
+#include <map>
+#include <utility>
 
 #include "gsim3d/raster/raster_blend.cuh"
 #include "gsim3d/raster/raster_check.h"
@@ -102,17 +104,22 @@ unsigned grid_of_chunks(const RasterScene<T>& s) {
   return grid_for(s.n_rows + std::min(s.n_clouds, s.n_rows) * (kBlock - 1), kBlock);
 }
 
-// As many blocks as are resident together, so that they may wait for each other.
+// As many blocks as are resident together, so that they may wait for each other. Their number is asked for once.
 template <typename... Formal>
 void launch_together(void (*kernel)(Formal...), size_t shared_bytes, Stream stream, Formal... arguments) {
-  check_cuda(cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, static_cast<int>(shared_bytes)),
-             kRaster);
-  int per_processor = 0, processors = 0;
-  check_cuda(cudaOccupancyMaxActiveBlocksPerMultiprocessor(&per_processor, kernel, kBlock, shared_bytes), kRaster);
-  check_cuda(cudaDeviceGetAttribute(&processors, cudaDevAttrMultiProcessorCount, stream.device), kRaster);
+  thread_local std::map<std::pair<const void*, int32_t>, unsigned> known;
+  const auto* code = reinterpret_cast<const void*>(kernel);
+  unsigned& blocks = known[{code, stream.device}];
+  if (blocks == 0) {
+    int per_processor = 0, processors = 0;
+    check_cuda(cudaFuncSetAttribute(code, cudaFuncAttributeMaxDynamicSharedMemorySize, static_cast<int>(shared_bytes)),
+               kRaster);
+    check_cuda(cudaOccupancyMaxActiveBlocksPerMultiprocessor(&per_processor, kernel, kBlock, shared_bytes), kRaster);
+    check_cuda(cudaDeviceGetAttribute(&processors, cudaDevAttrMultiProcessorCount, stream.device), kRaster);
+    blocks = per_processor * processors;
+  }
   void* pointers[] = {&arguments...};
-  check_cuda(cudaLaunchCooperativeKernel(reinterpret_cast<const void*>(kernel), dim3(per_processor * processors),
-                                         dim3(kBlock), pointers, shared_bytes, native(stream)),
+  check_cuda(cudaLaunchCooperativeKernel(code, dim3(blocks), dim3(kBlock), pointers, shared_bytes, native(stream)),
              kRaster);
 }
 

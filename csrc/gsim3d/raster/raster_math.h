@@ -43,6 +43,10 @@ template <typename V>
 GSIM3D_HD V abs_of(V a) {
   return a < V{} ? -a : a;
 }
+template <typename V>
+GSIM3D_HD V value_or_zero(const V* values, int64_t i) {
+  return values ? values[i] : V{};
+}
 
 // Finite, and small enough for the products of this file.
 template <typename S>

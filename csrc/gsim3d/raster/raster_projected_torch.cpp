@@ -1,7 +1,5 @@
-#include <initializer_list>
 #include <optional>
 #include <tuple>
-#include <utility>
 
 #include "gsim3d/raster/raster.h"
 #include "gsim3d/torch/raster_image_grads.h"
@@ -30,24 +28,18 @@ struct ProjectedTensors {
   void check_all() const {
     check_shape(op, "means2d", means2d, {-1, 2}, "[P, 2]");
     const int64_t n = n_rows();
-    check_shape(op, "conics", conics, {n, 3}, "[P, 3]");
-    check_shape(op, "depths", depths, {n}, "[P]");
-    check_shape(op, "opacities", opacities, {n}, "[P]");
-    check_shape(op, "colors", color, {n, 3}, "[P, 3]");
-    check_shape(op, "features", features, {n, -1}, "[P, F]");
-    check_shape(op, "background", background, {-1, 3}, "[I, 3]");
+    check_like(op, "conics", conics, {n, 3}, "[P, 3]", means2d);
+    check_like(op, "depths", depths, {n}, "[P]", means2d);
+    check_like(op, "opacities", opacities, {n}, "[P]", means2d);
+    check_like(op, "colors", color, {n, 3}, "[P, 3]", means2d);
+    check_like(op, "features", features, {n, -1}, "[P, F]", means2d);
+    check_like(op, "background", background, {-1, 3}, "[I, 3]", means2d);
     check_shape(op, "image_cloud", image_cloud, {n_images()}, "[I]");
     check_shape(op, "cu_rows", cu_rows, {n_images() + 1}, "[I + 1]");
     check_dtype(op, "cu_rows", cu_rows, ScalarType::Long);
     check_dtype(op, "image_cloud", image_cloud, ScalarType::Long);
     check(n_images() > 0 || n == 0, op, ": there must be an image; got none for ", n, " rows");
     check(width >= 0 && height >= 0, op, ": width and height must be positive; got ", width, " and ", height);
-    for (const auto& [name, tensor] : std::initializer_list<std::pair<const char*, const Tensor&>>{
-             {"conics", conics}, {"depths", depths}, {"opacities", opacities}, {"colors", color},
-             {"features", features}, {"background", background}}) {
-      check_dtype(op, name, tensor, means2d.scalar_type());
-      check_device(op, name, tensor, means2d);
-    }
     check_device(op, "cu_rows", cu_rows, means2d);
     check_device(op, "image_cloud", image_cloud, means2d);
   }
@@ -92,7 +84,7 @@ Images rasterize_projected(const Tensor& means2d, const Tensor& conics, const Te
   Tensor out_color = empty(in.means2d, {n, height, width, 3}), alpha = image(), depth = image();
   Tensor out_features = empty(in.means2d, {n, height, width, in.features.size(1)}), transmittance = image();
   Tensor last = empty(in.means2d, {n, height, width}, ScalarType::Int);
-  Tensor state = empty(in.means2d, {0}, ScalarType::Byte);
+  Tensor state;
   TensorWorkspace workspace(in.means2d);
   dispatch_float(given.op, "means2d", in.means2d, [&]<typename T>() {
     const RasterImages<T> images{mutable_data<T>(out_color),     mutable_data<T>(alpha),
@@ -106,6 +98,7 @@ Images rasterize_projected(const Tensor& means2d, const Tensor& conics, const Te
         state = empty(in.means2d, {cuda::raster_state_bytes(scene, limits)}, ScalarType::Byte);
         return cuda::raster_forward<T>(scene, images, limits, state.data_ptr(), workspace, current_stream(in.means2d));
       }
+    state = empty(in.means2d, {0}, ScalarType::Byte);
     cpu::raster_forward<T>(in.scene<T>(), images, workspace, torch_parallel());
   });
   return {out_color, alpha, depth, out_features, transmittance, last, state};
@@ -115,11 +108,11 @@ Images rasterize_projected(const Tensor& means2d, const Tensor& conics, const Te
 using ProjectedGrads = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 ProjectedGrads rasterize_projected_backward(
-    const Tensor& grad_color, const Tensor& grad_alpha, const Tensor& grad_depth, const Tensor& grad_features,
+    const Optional& grad_color, const Optional& grad_alpha, const Optional& grad_depth, const Optional& grad_features,
     const Tensor& transmittance, const Tensor& last, const Tensor& state, const Tensor& means2d,
     const Tensor& conics, const Tensor& depths, const Tensor& opacities, const Tensor& color, const Tensor& features,
     const Tensor& background, const Tensor& image_cloud, const Tensor& cu_rows, int64_t width, int64_t height,
-    int64_t cutoff, int64_t max_pairs, int64_t max_entries, int64_t max_slots, bool absolute) {
+    int64_t cutoff, int64_t max_pairs, int64_t max_entries, int64_t max_slots, bool background_grad, bool absolute) {
   const char* op = "rasterize_projected_backward";
   const ProjectedTensors given{op, means2d, conics, depths, opacities, color, features, background, image_cloud,
                                cu_rows, width, height, cutoff};
@@ -128,16 +121,18 @@ ProjectedGrads rasterize_projected_backward(
   const ImageGradTensors image{op, grad_color, grad_alpha, grad_depth, grad_features, transmittance, last, state,
                                in.n_images(), height, width, in.features.size(1), in.means2d};
 
-  const auto like = [](const Tensor& tensor) { return torch::stable::new_empty(tensor, tensor.sizes()); };
+  const auto like = [](const Tensor& tensor) { return empty(tensor, tensor.sizes()); };
   Tensor grad_means2d = like(in.means2d), grad_conics = like(in.conics), grad_depths = like(in.depths);
-  Tensor grad_opacities = like(in.opacities), grad_in_color = like(in.color), grad_background = like(in.background);
+  Tensor grad_opacities = like(in.opacities), grad_in_color = like(in.color);
+  Tensor grad_background = empty(in.background, {background_grad ? in.n_images() : 0, 3});
   Tensor grad_in_features = empty(in.features, {in.n_rows(), in.features.size(1) + (absolute ? 2 : 0)});
   TensorWorkspace workspace(in.means2d);
   dispatch_float(op, "means2d", in.means2d, [&]<typename T>() {
     const RasterImageGrads<T> image_grads = image.grads<T>();
     RasterSceneGrads<T> grads{};
     grads.opacities = mutable_data<T>(grad_opacities), grads.color = mutable_data<T>(grad_in_color);
-    grads.features = mutable_data<T>(grad_in_features), grads.background = mutable_data<T>(grad_background);
+    grads.features = mutable_data<T>(grad_in_features);
+    grads.background = background_grad ? mutable_data<T>(grad_background) : nullptr;
     grads.means2d = mutable_data<T>(grad_means2d), grads.conics = mutable_data<T>(grad_conics);
     grads.depths = mutable_data<T>(grad_depths), grads.absolute = absolute;
     if constexpr (kWithCuda)

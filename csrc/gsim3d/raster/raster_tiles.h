@@ -151,7 +151,7 @@ template <typename T>
 void blend_group_vjp(const RasterScene<T>& scene, const Group<T>& group, const RasterImageGrads<T>& image_grads,
                      T* slots,            // [n_instances, kSlotFixed + feature columns]
                      T* tile_background,  // [images * tiles, 3] scratch
-                     T* grad_background,  // [n_images, 3]
+                     T* grad_background,  // [n_images, 3] or null
                      bool absolute,       // as of RasterSceneGrads
                      const Parallel& parallel);
 

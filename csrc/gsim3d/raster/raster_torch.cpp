@@ -164,7 +164,7 @@ SceneGrads rasterize_gaussians_backward(const Tensor& grad_color, const Tensor& 
   const ImageGradTensors image{op, grad_color, grad_alpha, grad_depth, grad_features, transmittance, last, state,
                                n, height, width, in.features.size(1), in.means};
 
-  const auto like = [](const Tensor& tensor) { return torch::stable::new_empty(tensor, tensor.sizes()); };
+  const auto like = [](const Tensor& tensor) { return empty(tensor, tensor.sizes()); };
   Tensor grad_means = like(in.means), grad_quats = like(in.quats), grad_scales = like(in.scales);
   Tensor grad_opacities = like(in.opacities), grad_in_color = like(in.color), grad_in_features = like(in.features);
   Tensor grad_background = like(in.background);
@@ -230,7 +230,7 @@ Tangents rasterize_gaussians_backward_tangent(
     check_dtype(op, "image_grads", image_grads[i], in.means.scalar_type());
     check_device(op, "image_grads", image_grads[i], in.means);
   }
-  for (const Tensor* value : values) out.push_back(torch::stable::new_empty(*value, value->sizes()));
+  for (const Tensor* value : values) out.push_back(empty(*value, value->sizes()));
   TensorWorkspace workspace(in.means);
   dispatch_float(op, "means", in.means, [&]<typename T>() {
     const auto& t = tangents;

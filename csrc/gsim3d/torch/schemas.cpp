@@ -135,7 +135,7 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "lens, bool clamped, bool antialiased) -> (Tensor means2d, Tensor conics, Tensor depths, Tensor radii, Tensor "
       "compensations)");
   m.def(
-      "project_gaussians_backward(Tensor grad_means2d, Tensor grad_conics, Tensor grad_depths, Tensor "
+      "project_gaussians_backward(Tensor? grad_means2d, Tensor? grad_conics, Tensor? grad_depths, Tensor? "
       "grad_compensations, Tensor radii, Tensor means, Tensor? quats, Tensor? scales, Tensor? covars, Tensor viewmats, "
       "Tensor Ks, Tensor? distortion, Tensor image_cloud, Tensor cu_rows, Tensor cu_pairs, SymInt n_pairs, int width, "
       "int height, float dilation, int lens, bool clamped, bool viewmats_grad, bool lens_grad) -> (Tensor means, Tensor "
@@ -184,11 +184,11 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "cutoff, SymInt max_pairs, SymInt max_entries, SymInt max_slots) -> (Tensor color, Tensor alpha, Tensor depth, "
       "Tensor features, Tensor transmittance, Tensor last, Tensor state)");
   m.def(
-      "rasterize_projected_backward(Tensor grad_color, Tensor grad_alpha, Tensor grad_depth, Tensor grad_features, "
+      "rasterize_projected_backward(Tensor? grad_color, Tensor? grad_alpha, Tensor? grad_depth, Tensor? grad_features, "
       "Tensor transmittance, Tensor last, Tensor state, Tensor means2d, Tensor conics, Tensor depths, Tensor opacities, "
       "Tensor color, Tensor features, Tensor background, Tensor image_cloud, Tensor cu_rows, int width, int height, int "
-      "cutoff, SymInt max_pairs, SymInt max_entries, SymInt max_slots, bool absolute) -> (Tensor means2d, Tensor "
-      "conics, Tensor depths, Tensor opacities, Tensor color, Tensor features, Tensor background)");
+      "cutoff, SymInt max_pairs, SymInt max_entries, SymInt max_slots, bool background_grad, bool absolute) -> (Tensor "
+      "means2d, Tensor conics, Tensor depths, Tensor opacities, Tensor color, Tensor features, Tensor background)");
 }
 
 // The library is loaded by importing it; its contents are the registered ops.

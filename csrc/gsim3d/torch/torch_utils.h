@@ -12,8 +12,10 @@
 #include <torch/csrc/inductor/aoti_torch/c/shim.h>
 #endif
 
+#include <algorithm>
 #include <cstdint>
 #include <initializer_list>
+#include <optional>
 #include <stdexcept>
 #include <string>
 #include <vector>
@@ -27,6 +29,8 @@ namespace gsim3d::binding {
 
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
+using Optional = std::optional<Tensor>;
+using Sizes = torch::headeronly::IntHeaderOnlyArrayRef;
 
 // Runs chunks on torch's intra-op pool; on one thread in a forked child, where that pool would wait for threads that
 // are not there.
@@ -130,10 +134,20 @@ inline void check_device(const char* op, const char* name, const Tensor& tensor,
         " must be on ", device_of(like), " like the first argument; got ", device_of(tensor));
 }
 
+// Where there is a tensor: its shape, and dtype and device of `like`.
+inline void check_like(const char* op, const char* name, const Optional& tensor, std::initializer_list<int64_t> sizes,
+                       const char* wanted, const Tensor& like) {
+  if (!tensor) return;
+  check_shape(op, name, *tensor, sizes, wanted);
+  check_dtype(op, name, *tensor, like.scalar_type());
+  check_device(op, name, *tensor, like);
+}
+
 // Contiguous, so that the core can read it by pointer.
 inline Tensor rows_of(const Tensor& tensor) {
   return tensor.is_contiguous() ? tensor : torch::stable::contiguous(tensor);
 }
+inline Optional rows_of(const Optional& tensor) { return tensor ? Optional(rows_of(*tensor)) : tensor; }
 
 // Calls f.template operator()<T>() with T = float or double, by the dtype of `tensor`.
 template <typename F>
@@ -149,18 +163,27 @@ const T* data(const Tensor& tensor) {
   return static_cast<const T*>(tensor.data_ptr());
 }
 template <typename T>
+const T* data_or_null(const Optional& tensor) {
+  return tensor ? data<T>(*tensor) : nullptr;
+}
+template <typename T>
 T* mutable_data(Tensor& tensor) {
   return static_cast<T*>(tensor.data_ptr());
 }
 
-inline Tensor empty(const Tensor& like, std::initializer_list<int64_t> sizes) {
-  const std::vector<int64_t> shape(sizes);
-  return torch::stable::new_empty(like, shape);
+// By a C function, not by the dispatcher, which takes longer than torch's allocator.
+inline Tensor empty(const Tensor& like, Sizes sizes, ScalarType type) {
+  std::vector<int64_t> strides(sizes.size(), 1);
+  for (size_t i = sizes.size(); i-- > 1;) strides[i - 1] = strides[i] * std::max<int64_t>(1, sizes[i]);
+  int32_t device;
+  STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch_get_device_type(like.get(), &device));
+  AtenTensorHandle made;
+  STABLE_TORCH_ERROR_CODE_CHECK(aoti_torch_empty_strided(
+      static_cast<int64_t>(sizes.size()), sizes.data(), strides.data(),
+      torch::stable::detail::to<int32_t>(torch::stable::detail::from(type)), device, like.get_device_index(), &made));
+  return Tensor(made);
 }
-inline Tensor empty(const Tensor& like, std::initializer_list<int64_t> sizes, ScalarType type) {
-  const std::vector<int64_t> shape(sizes);
-  return torch::stable::new_empty(like, shape, type);
-}
+inline Tensor empty(const Tensor& like, Sizes sizes) { return empty(like, sizes, like.scalar_type()); }
 
 // Scratch in tensors on the device of `like`; freed with the object.
 class TensorWorkspace {

@@ -107,7 +107,7 @@ std::tuple<Tensor, Tensor, std::vector<Tensor>> validate_state(
   std::vector<Tensor> made;
   if (!neutral.empty()) {
     made.push_back(empty(activity, {n}));
-    for (const Tensor& field : fields) made.push_back(torch::stable::new_empty(field, field.sizes()));
+    for (const Tensor& field : fields) made.push_back(empty(field, field.sizes()));
   }
   dispatch_float(op, "fields", fields[0], [&]<typename T>() {
     StateRows<T> rows{};
