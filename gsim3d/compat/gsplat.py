@@ -282,10 +282,8 @@ def _images(image: Rendering, render_mode: str, sizes: tuple[int, ...]) -> tuple
     """Colour with depth as the last channel, and alpha."""
     color, alpha = image.color, image.alpha[..., None]
     if render_mode != "RGB":
-        depth = image.depth[..., None]
-        if render_mode.endswith("ED"):
-            depth = depth / alpha.clamp_min(1e-10)
-        color = torch.cat([color, depth], -1) if "RGB" in render_mode else depth
+        depth = image.depth / image.alpha.clamp_min(1e-10) if render_mode.endswith("ED") else image.depth
+        color = torch.cat([color, depth[..., None]], -1) if "RGB" in render_mode else depth[..., None]
     if len(sizes) == 1:
         return color, alpha
     return color.unflatten(0, sizes), alpha.unflatten(0, sizes)
