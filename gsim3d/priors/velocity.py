@@ -16,11 +16,10 @@ SMOOTHING = 0.5  # share of the old mean velocity in the new one
 
 @dataclass(frozen=True)
 class VelocityConfig(PriorConfig):
-    """Smoothed displacement of the movable particles.
+    """Velocities of the movable particles.
 
     Attributes:
-        radius: standard deviation in metres of the windows whose means are followed through encoded clouds; about the
-            radius of a body.
+        radius: standard deviation in metres of the windows that encoded clouds share; about the radius of a body.
     """
 
     type = "velocity"
@@ -36,7 +35,8 @@ class Velocity(Prior, config=VelocityConfig):
     The network rounds positions to cells, and so does not see motions below a cell. In encoded clouds v_1 is the
     displacement of the mean of a particle's window since the cloud before, and v_2 the slope of the line through the
     means in all clouds of the history, which has less noise. A step with displacement d changes v_2 to (v_2 + d) / 2,
-    so that it lags behind by 1.5 steps, as that of four encoded clouds. Gradients flow through displacements, not
+    so that it lags behind by 1.5 steps, as that of four encoded clouds. With ``velocity_from_images`` before it in the
+    list, v_2 is what that has found in the images, which knows spins, too. Gradients flow through displacements, not
     through encoded velocities.
     """
 
@@ -48,6 +48,7 @@ class Velocity(Prior, config=VelocityConfig):
         if frames is None or ctx.is_empty:
             return particles
         last, mean = map(ctx.scatter_newest, window_velocities(ctx, self.config.radius))
+        mean = mean if ctx.priors.get("velocity_from_images") is None else particles.velocity
         return replace(particles, velocity=last, mean_velocity=mean)
 
     def features(self, ctx: StepContext) -> Tensor:
@@ -93,8 +94,7 @@ def window_velocities(ctx: StepContext, radius: float) -> tuple[Tensor, Tensor]:
 
 
 def slope_weights(ages: list[int]) -> tuple[list[int], int]:
-    """Weights, and what divides them, of the displacements since points of these ages in the slope of the line through
-    them and the newest point, by least squares."""
+    """Weights, and their divisor, of the displacements since points of these ages in the slope of their line."""
     count, total = len(ages) + 1, sum(ages)
     divisor = count * sum(age**2 for age in ages) - total**2
     return [count * age - total for age in ages], max(1, divisor)

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.priors import Motion, VelocityConfig
+from gsim3d.priors import Motion, VelocityConfig, VelocityFromImagesConfig
 from gsim3d.priors.velocity import slope_weights, window_velocities
 from gsim3d.state import DYNAMIC, FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
@@ -130,6 +130,16 @@ def test_frozen_particles_and_older_clouds_have_none():
     assert prior.initialize(ctx.history, ctx) is ctx.history  # edits keep velocities
     ctx = context(begun, VelocityConfig(), grid_size=CELL)
     assert_same_bits(prior.features(ctx), torch.cat([begun.velocity, begun.mean_velocity], 1) / CELL)
+
+
+def test_velocities_of_images_are_the_mean():
+    history = flown()
+    found = torch.rand(history.means.shape, generator=torch.Generator().manual_seed(0))
+    history = dataclasses.replace(history, velocity=found)
+    ctx = context(history, VelocityFromImagesConfig(), VelocityConfig(), grid_size=CELL)
+    begun = ctx.priors.get("velocity").initialize(ctx.history, ctx, FRAMES)
+    assert begun.mean_velocity is found
+    assert_same_bits(ctx.select_newest(begun.velocity), both_of(history)[0])
 
 
 def test_scenes_are_independent():
