@@ -23,7 +23,7 @@ from gsim3d.effects.edits import (
 from gsim3d.effects.spec import DynamicsEffects, EffectsSpec, Sleep, StructureEffects
 from gsim3d.errors import InputError
 from gsim3d.priors import InertiaConfig, ShapeMatchingConfig
-from gsim3d.state import DYNAMIC, FROZEN, append_step, last_steps
+from gsim3d.state import DYNAMIC, FROZEN, VELOCITIES, append_step, last_steps, with_attribute
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.effects.models import MODELS
 from tests.priors.scenes import OCCLUSION
@@ -133,11 +133,16 @@ def test_rotate_pivot_and_velocity():
 def test_throw_adds_velocity():
     simulator, state, _ = encoded(CONFIG, (3, 2))
     velocity = torch.tensor([0.03, 0.0, -0.02])
+    for name in VELOCITIES:
+        state = with_attribute(state, name)
     thrown = edited(simulator, state, Throw("moving", tuple(velocity.tolist())))
     moving = state.activity == DYNAMIC
     ages = torch.tensor([2, 1, 0, 1, 0])[state.row_cloud()][moving, None]
     assert_close_relative_to_max((state.means - thrown.means)[moving], ages * velocity, 1e-4)
     assert_same_bits(thrown.means[~moving], state.means[~moving])
+    for known in (thrown.velocity, thrown.mean_velocity):
+        assert_close_relative_to_max(known[moving], velocity.expand(int(moving.sum()), 3), 1e-6)
+        assert not known[~moving].any()
     with pytest.raises(InputError, match="edit at step 4, throw: a history of one step has no velocity"):
         one = EffectsSpec(dynamics=DynamicsEffects(history=1))
         future(simulator, state, 5, [Edit(4, Throw("moving", (1.0, 0.0, 0.0)))], one)
