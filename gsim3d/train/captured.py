@@ -101,7 +101,7 @@ class CapturedLoss:
 
     Attributes:
         parameters: all parameters of the simulator, in the order of the gradients returned.
-        alone: context in which no other thread uses the GPU, entered for captures.
+        alone: context in which no other thread uses the GPU or the simulator, entered for captures.
         meanwhile: called while the graph runs, for host work that should overlap with it.
         captures: number of captured graphs.
         most_particles: largest number of particles of a cloud so far.
@@ -229,24 +229,24 @@ class _Step:
 
     def __call__(self, prepared: Prepared, weights: Tensor, report: StabilityReport) -> Gradients:
         self._load(prepared, weights)
-        if not self._is_ready:
-            self._grow(self._observed())
-            self._capture()
-        loss, errors, gradients, found, records = self._replay()
+        done = self._replay() if self._is_ready else self._fitted()
         self._owner.meanwhile()
-        while True:
-            numbers = found.tolist()
-            if fit(self._capacities, numbers):
-                break
-            self._graph = self._records = loss = errors = gradients = found = None  # frees memory before the capture
+        while not fit(self._capacities, numbers := done[3].tolist()):
+            self._graph = self._records = done = None  # frees memory before the capture
             too_small = [not c.fits(sizes) for c, sizes in zip(self._capacities, numbers, strict=True)].index(True)
-            valid = [tuple(sizes[1:]) for sizes in numbers[: too_small + 1]]  # those behind it are not
-            self._grow(self._observed(), valid)
-            self._capture()
-            loss, errors, gradients, found, records = self._replay()
+            done = self._fitted([tuple(sizes[1:]) for sizes in numbers[: too_small + 1]])  # those behind it are wrong
+        loss, errors, gradients, _, records = done
         self._owner.grow(self._clouds, [tuple(sizes[1:]) for sizes in numbers])
         records.replayed(report)
         return Gradients(loss, errors, gradients)
+
+    def _fitted(self, found: Sequence[tuple[int, ...]] = ()) -> tuple:
+        """Captures with capacity for this batch and the sizes ``found``, and computes it. No batch is prepared
+        meanwhile, in another thread: weights are replaced by rounded ones."""
+        with self._owner.alone:
+            self._grow(self._observed(), found)
+            self._capture()
+            return self._replay()
 
     def _grow(self, observed: Sequence[PyramidCapacity], found: Sequence[tuple[int, ...]] = ()) -> None:
         """Makes capacity for the largest sizes of all kinds of batches: what was exceeded once will soon be again."""
@@ -401,8 +401,7 @@ class _Step:
                     self._records = report
                 return self._given(report)
 
-            with self._owner.alone:
-                self._graph = self._owner.graph(self, function)
+            self._graph = self._owner.graph(self, function)
         self._is_ready = True
 
     def _replay(self) -> tuple:

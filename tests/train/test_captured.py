@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import json
 import math
+import threading
 from contextlib import nullcontext
 from functools import partial
 
@@ -417,6 +418,22 @@ def test_capacity_grows_where_a_batch_needs_more(scenes, trainer, device):
     torch.testing.assert_close(run(captured, batch, trainer).loss, loss, rtol=TOLERANCE[device.type], atol=0)
     (after,) = (step.particles for step in captured._steps.values())
     assert max(captured.prepare(batch).counts) <= after and before <= after
+
+
+def test_no_batch_is_prepared_while_weights_are_rounded(scenes, trainer, device):
+    """Else its images would have another dtype than the network for as long as another thread captures."""
+    captured, seen = captured_loss(trainer), []
+    captured.alone, captured.meanwhile = threading.Lock(), seen.clear
+    captured.precision = lambda part: torch.autocast(device.type, torch.bfloat16, enabled=part == "encoder")
+    convolution = next(part for part in trainer.simulator.encoder.modules() if isinstance(part, torch.nn.Conv2d))
+    convolution.register_forward_pre_hook(lambda *_: seen.append(captured.alone.locked()))
+    batch = batches(scenes, 1)[0].to(device)
+    run(captured, batch, trainer)
+    (step,) = captured._steps.values()
+    step._capacities = [dataclasses.replace(c, sizes=(c.sizes[0], *(1 for _ in c.sizes[1:]))) for c in step._capacities]
+    step._capture()
+    run(captured, batch, trainer)  # the next batch is prepared from the first replay on
+    assert seen and all(seen)
 
 
 def test_weights_are_read_anew(scenes, trainer, device):
