@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+LEAST_WEIGHT = 0.3  # of a node in some vertex, of the largest one of all nodes
 NEIGHBOURS = 12  # particles that a point is bound to; an affine motion needs four in general position
 
 
@@ -32,6 +33,7 @@ class ControlGrid:
     #: bool [c, c, c], cells with collision vertices whose corners all move with the body. Nodes of other cells are not
     #: simulated.
     occupied: np.ndarray
+    vertices: np.ndarray  #: [N, 3], of the body at frame 0
 
     def bind(self, points: np.ndarray) -> Binding:
         """Binds ``points`` [N, 3] at frame 0 to their nearest occupied cells, by trilinear weights.
@@ -131,6 +133,16 @@ class ParticleCloud:
 
 
 Embedding = ControlGrid | RigidFrame | ClothGrid | ParticleCloud
+
+
+def states(embedding: Embedding) -> np.ndarray:
+    """Nodes as float32; those of a control grid that hardly move a vertex may fall for ever, and are at the origin."""
+    nodes = embedding.nodes.astype(np.float32)
+    if isinstance(embedding, ControlGrid):
+        binding, most = embedding.bind(embedding.vertices), np.zeros(nodes[0, ..., 0].shape)
+        np.maximum.at(most.reshape(-1), binding.corners, binding.weights)
+        nodes[:, most < LEAST_WEIGHT * most.max()] = 0
+    return nodes
 
 
 def _nearest(nodes: np.ndarray, point: np.ndarray, count: int) -> np.ndarray:

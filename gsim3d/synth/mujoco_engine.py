@@ -186,7 +186,7 @@ class _Soft:
         return self.data.xpos[self.bodies].reshape(*self.shape, 3)
 
     def embedding(self, nodes: np.ndarray) -> ControlGrid:
-        return ControlGrid(nodes, self.occupied)
+        return ControlGrid(nodes, self.occupied, self.body.vertices)
 
 
 class _Rigid:

@@ -17,7 +17,7 @@ from gsim3d.effects.spec import AppearanceEffects, DynamicsEffects, EffectsSpec,
 from gsim3d.errors import InputError, check_ranges, did_you_mean
 from gsim3d.synth import cameras, render, scene_setup, shapes, writer
 from gsim3d.synth.bodies import OBJECTS, load_mesh, mesh_bytes, mesh_name
-from gsim3d.synth.embedding import Embedding, grid_faces
+from gsim3d.synth.embedding import Embedding, grid_faces, states
 from gsim3d.synth.scene_setup import Cloth, RigidBody, SceneSetup, SoftBody, Unstable
 
 MAX_ATTEMPTS = 40  # draws of a scene before it fails
@@ -244,7 +244,7 @@ class World(ABC):
                 self.fps,
                 rig,
                 views=[renderer.draw(vertices) for vertices in zip(*moved)],
-                states={name: embedding.nodes.astype(np.float32) for name, embedding in zip(names, embeddings)},
+                states={name: states(embedding) for name, embedding in zip(names, embeddings)},
                 extras={
                     **{"world": self.name, "subset": self.subset, "engine": self.engine, "seed": self.seed},
                     **{"attempt": attempt, "rejected": rejected, "ground_height": drawn.ground},

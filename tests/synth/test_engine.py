@@ -234,9 +234,17 @@ def test_control_grid_binds_to_occupied_cells_only():
     occupied = np.zeros((3, 3, 3), dtype=bool)
     occupied[1, 1, 1] = True
     points = np.random.default_rng(0).uniform(-0.2, 1.2, (50, 3))
-    binding = embedding.ControlGrid(rest[None], occupied).bind(points)
+    binding = embedding.ControlGrid(rest[None], occupied, points).bind(points)
     np.testing.assert_allclose(binding.move(rest), points, atol=1e-12)
     assert set(np.unique(binding.corners)) == {(x * 4 + y) * 4 + z for x in (1, 2) for y in (1, 2) for z in (1, 2)}
+
+
+def test_states_leave_out_nodes_that_hardly_move_a_vertex(motion):
+    rest = np.stack(np.meshgrid(*[np.linspace(0, 1, 3)] * 3, indexing="ij"), -1)
+    grid = embedding.ControlGrid(np.stack([rest, rest + 1]), np.ones((2, 2, 2), dtype=bool), np.array([[0.6, 1, 1]]))
+    known = (embedding.states(grid) != 0).any((0, -1))
+    assert known[1, 2, 2] and known.sum() == 1  # the other node of the edge has a quarter of its weight
+    assert embedding.states(motion[0]).dtype == np.float32
 
 
 def test_simulation_repeats_bit_by_bit(motion, ball):
