@@ -1,4 +1,4 @@
-"""Velocity: particles see how fast they move, and predicted gains carry them on."""
+"""Velocity: particles see how fast they move, and go on so but for what the network predicts."""
 
 from dataclasses import dataclass, replace
 
@@ -30,14 +30,16 @@ class VelocityConfig(PriorConfig):
 
 class Velocity(Prior, config=VelocityConfig):
     """Features of the newest particles: the last displacement v_1 and the mean velocity v_2. Predicted gains g [2, 3]
-    add g_1 v_1 + g_2 v_2 (elementwise) to a displacement.
+    add g_1 v_1 + (1 + g_2) v_2 (elementwise) to a displacement.
 
-    The network rounds positions to cells, and so does not see motions below a cell. In encoded clouds v_1 is the
-    displacement of the mean of a particle's window since the cloud before, and v_2 the slope of the line through the
-    means in all clouds of the history, which has less noise. A step with displacement d changes v_2 to (v_2 + d) / 2,
-    so that it lags behind by 1.5 steps, as that of four encoded clouds. With ``velocity_from_images`` before it in the
-    list, v_2 is what that has found in the images, which knows spins, too. Gradients flow through displacements, not
-    through encoded velocities.
+    So without gains the network predicts changes of velocities, as graph network simulators do (Sanchez-Gonzalez et al.
+    2020): a fall is a constant, and -1 is rest. It rounds positions to cells, and would not see motions below a cell.
+
+    In encoded clouds v_1 is the displacement of the mean of a particle's window since the cloud before, and v_2 the
+    slope of the line through the means in all clouds of the history, which has less noise. A step with displacement d
+    changes v_2 to (v_2 + d) / 2, so that it lags behind by 1.5 steps, as that of four encoded clouds. With
+    ``velocity_from_images`` before it in the list, v_2 is what that has found in the images, which knows spins, too.
+    Gradients flow through displacements, not through encoded velocities.
     """
 
     attributes = ("velocity", "mean_velocity")
@@ -56,7 +58,8 @@ class Velocity(Prior, config=VelocityConfig):
 
     def move(self, motion: Motion, gains: Tensor, ctx: StepContext) -> Motion:
         velocities = torch.stack([ctx.state.velocity, ctx.state.mean_velocity], 1)
-        return replace(motion, gained=motion.gained + (bounded_gains(gains) * velocities).sum(1))
+        carried = ctx.state.mean_velocity + (bounded_gains(gains) * velocities).sum(1)
+        return replace(motion, gained=motion.gained + carried)
 
     def finish(self, step: Particles, gains: Tensor, ctx: StepContext) -> Particles:
         moved = step.means - ctx.state.means
