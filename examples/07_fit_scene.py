@@ -79,8 +79,8 @@ class Splats:
             "scales": third_neighbour(points).log().repeat(1, 3), "opacities": torch.full((n,), -2.0),
         }  # fmt: skip
         self.rows = {name: value.to(device).clone().requires_grad_() for name, value in start.items()}
-        rates = {name: rate * QUICK * (extent if name == "means" else 1) for name, rate in RATES.items()}
-        groups = [{"params": [self.rows[name]], "lr": rate, "name": name} for name, rate in rates.items()]
+        self.rates = {name: rate * QUICK * (extent if name == "means" else 1) for name, rate in RATES.items()}
+        groups = [{"params": [self.rows[name]], "lr": rate, "name": name} for name, rate in self.rates.items()]
         self.adam = torch.optim.Adam(groups, eps=1e-15)
         self.forget()
 
@@ -146,6 +146,8 @@ def fit(name, call, points, extent, viewmats, K, images):
     seen = (~held_out).nonzero()[:, 0].tolist()
     every = max(10, options.steps // 70)
     for step in range(1, options.steps + 1):
+        for group in splats.adam.param_groups:  # to a tenth in the last 30 %, without new Gaussians
+            group["lr"] = splats.rates[group["name"]] * 0.1 ** max(0, step / options.steps / 0.3 - 7 / 3)
         i, began = seen[torch.randint(len(seen), ()).item()], now()
         image, _, meta = splats.render(call, viewmats[i : i + 1], K)
         meta["means2d"].retain_grad()
