@@ -235,14 +235,12 @@ class _Step:
             self._graph = self._records = done = None  # frees memory before the capture
             too_small = [not c.fits(sizes) for c, sizes in zip(self._capacities, numbers, strict=True)].index(True)
             done = self._fitted([tuple(sizes[1:]) for sizes in numbers[: too_small + 1]])  # those behind it are wrong
-        loss, errors, gradients, _, records = done
         self._owner.grow(self._clouds, [tuple(sizes[1:]) for sizes in numbers])
-        records.replayed(report)
-        return Gradients(loss, errors, gradients)
+        done[4].replayed(report)
+        return Gradients(*done[:3])
 
     def _fitted(self, found: Sequence[tuple[int, ...]] = ()) -> tuple:
-        """Captures with capacity for this batch and the sizes ``found``, and computes it. No batch is prepared
-        meanwhile, in another thread: weights are replaced by rounded ones."""
+        """Captures with room for the batch and sizes ``found``, and computes it; other threads see rounded weights."""
         with self._owner.alone:
             self._grow(self._observed(), found)
             self._capture()

@@ -38,16 +38,7 @@ from gsim3d.train.gradients import (
     recomputing,
 )
 from gsim3d.train.left_out import draw_left_out, images_per_cloud, with_views
-from gsim3d.train.log import (
-    Log,
-    Sample,
-    draw_sample,
-    memory_gib,
-    plain,
-    profiler,
-    progress_note,
-    sample_video,
-)
+from gsim3d.train.log import Log, Sample, draw_sample, memory_gib, plain, profiler, progress_note, sample_video
 from gsim3d.train.losses import draw_alone, time_weights, training_loss
 from gsim3d.train.optimizer import FIRST_SCALE, LossScale, Optimizer, deterministic, one_cycle, update_average
 from gsim3d.train.processes import Processes
