@@ -238,8 +238,7 @@ class Scene:
             allowed = [cam for cam in (known and inputs.context_cameras) or range(self.n_cams) if cam not in excluded]
             n = min(inputs.context_views, len(allowed))
             cams = sorted(allowed[k * len(allowed) // n] for k in range(n))
-        steps = range(start, start + inputs.history)
-        return make_frames([self], [list(cams)], [steps])
+        return make_frames([self], [list(cams)], [range(start, start + inputs.history)])
 
     def _numbers(self, cams, steps) -> tuple[list[int], list[int]]:
         cams, steps = [int(c) for c in cams], [int(s) for s in steps]

@@ -162,5 +162,5 @@ def true_states(scene: Scene) -> list[Tensor] | None:
     flat = [nodes[::stride].flatten(1, -2) for nodes in found]
     if flat and min(map(len, flat)) < scene.n_steps:
         raise InputError(f"{file}: {min(map(len, found))} steps, fewer than the scene has")
-    # A lattice has nodes that move nothing, at the origin.
+    # A lattice has unused nodes, at the origin.
     return [nodes[:, ~(nodes == 0).all(-1).any(0)] - torch.from_numpy(scene.world_offset) for nodes in flat] or None

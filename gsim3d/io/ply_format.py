@@ -146,8 +146,7 @@ class _Binary:
         self._move(count * dtype.itemsize)
         if not count * dtype.itemsize:
             return [np.zeros(count, kind) for kind in kinds]
-        table = np.frombuffer(self.body, dtype, count, begin)
-        return [table[name] for name in dtype.names]
+        return [np.frombuffer(self.body, dtype, count, begin)[name] for name in dtype.names]
 
     def skip(self, count: int, kind: str) -> None:
         self._move(count * np.dtype(kind).itemsize)

@@ -136,16 +136,18 @@ Embedding = ControlGrid | RigidFrame | ClothGrid | ParticleCloud
 
 
 def states(embedding: Embedding) -> np.ndarray:
-    """Nodes as float32; those of a control grid that hardly move a vertex may fall for ever, and are at the origin."""
+    """Nodes as float32; those of a control grid that hardly move a vertex, and might fall, go with the others."""
     nodes = embedding.nodes.astype(np.float32)
     if isinstance(embedding, ControlGrid):
         binding, most = embedding.bind(embedding.vertices), np.zeros(nodes[0, ..., 0].shape)
         np.maximum.at(most.reshape(-1), binding.corners, binding.weights)
-        nodes[:, most < LEAST_WEIGHT * most.max()] = 0
+        held = most >= LEAST_WEIGHT * most.max()
+        if not held.all():
+            loose = ParticleCloud(embedding.nodes[:, held]).bind(embedding.nodes[0, ~held])
+            nodes[:, ~held] = [loose.move(step) for step in embedding.nodes[:, held]]
     return nodes
 
 
 def _nearest(nodes: np.ndarray, point: np.ndarray, count: int) -> np.ndarray:
     distance = ((nodes - point) ** 2).sum(1)
-    chosen = np.argpartition(distance, count - 1)[:count]
-    return np.sort(chosen)
+    return np.sort(np.argpartition(distance, count - 1)[:count])

@@ -239,12 +239,19 @@ def test_control_grid_binds_to_occupied_cells_only():
     assert set(np.unique(binding.corners)) == {(x * 4 + y) * 4 + z for x in (1, 2) for y in (1, 2) for z in (1, 2)}
 
 
-def test_states_leave_out_nodes_that_hardly_move_a_vertex(motion):
-    rest = np.stack(np.meshgrid(*[np.linspace(0, 1, 3)] * 3, indexing="ij"), -1)
-    grid = embedding.ControlGrid(np.stack([rest, rest + 1]), np.ones((2, 2, 2), dtype=bool), np.array([[0.6, 1, 1]]))
-    known = (embedding.states(grid) != 0).any((0, -1))
-    assert known[1, 2, 2] and known.sum() == 1  # the other node of the edge has a quarter of its weight
-    assert embedding.states(motion[0]).dtype == np.float32
+def test_states_hold_nodes_that_hardly_move_a_vertex():
+    rest = np.stack(np.meshgrid(*[np.linspace(0, 1, 4)] * 3, indexing="ij"), -1)
+    vertices = np.stack(np.meshgrid(*[[0, 0.3, 0.7, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
+    vertices = vertices[vertices.max(1) < 1]  # none near the nodes of three sides
+    nodes = np.stack([rest, rest + 1])
+    nodes[1, 3, 3, 3] -= 20  # without a vertex nearby
+    nodes[1, 0, 0, 0] += 0.1  # at a vertex
+    grid = embedding.ControlGrid(nodes, np.ones((3, 3, 3), dtype=bool), vertices)
+    found = embedding.states(grid)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found[0], rest, atol=1e-6)
+    np.testing.assert_allclose(found[1, 3, 3, 3], [2, 2, 2], atol=1e-5)
+    np.testing.assert_allclose(found[1, 0, 0, 0], [1.1, 1.1, 1.1], atol=1e-6)
 
 
 def test_simulation_repeats_bit_by_bit(motion, ball):
