@@ -146,7 +146,7 @@ def fit(name, call, points, extent, viewmats, K, images):
     seen = (~held_out).nonzero()[:, 0].tolist()
     every = max(10, options.steps // 70)
     for step in range(1, options.steps + 1):
-        for group in splats.adam.param_groups:  # to a tenth in the last 30 %, without new Gaussians
+        for group in splats.adam.param_groups:  # decay to a tenth in the last 30 %, after densification
             group["lr"] = splats.rates[group["name"]] * 0.1 ** max(0, step / options.steps / 0.3 - 7 / 3)
         i, began = seen[torch.randint(len(seen), ()).item()], now()
         image, _, meta = splats.render(call, viewmats[i : i + 1], K)

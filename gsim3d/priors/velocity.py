@@ -1,4 +1,4 @@
-"""Velocity: particles see how fast they move, and go on so but for what the network predicts."""
+"""Velocity: a step carries velocities on, and the network predicts their changes."""
 
 from dataclasses import dataclass, replace
 
@@ -32,8 +32,8 @@ class Velocity(Prior, config=VelocityConfig):
     """Features of the newest particles: the last displacement v_1 and the mean velocity v_2. Predicted gains g [2, 3]
     add g_1 v_1 + (1 + g_2) v_2 (elementwise) to a displacement.
 
-    So the network predicts changes of velocities, as graph network simulators do (Sanchez-Gonzalez et al. 2020), and
-    sees motions below a cell, to which it rounds positions. In encoded clouds v_1 is the displacement of the mean of a
+    The network then predicts changes of velocities, as graph network simulators do (Sanchez-Gonzalez et al. 2020), and
+    reads motions below a cell, to which it rounds positions. In encoded clouds v_1 is the displacement of the mean of a
     particle's window since the cloud before, and v_2 the slope of the line through the means in all clouds of the
     history, which has less noise; with ``velocity_from_images`` before it in the list, what that has found, spins, too.
     A step with displacement d changes v_2 to (v_2 + d) / 2, which lags behind by 1.5 steps, as that of four encoded
@@ -55,8 +55,8 @@ class Velocity(Prior, config=VelocityConfig):
         return ctx.scatter_newest(torch.cat([ctx.state.velocity, ctx.state.mean_velocity], 1)) / ctx.grid_size
 
     def move(self, motion: Motion, gains: Tensor, ctx: StepContext) -> Motion:
-        last, mean = bounded_gains(gains).unbind(1)
-        return replace(motion, gained=motion.gained + last * ctx.state.velocity + (1 + mean) * ctx.state.mean_velocity)
+        g_1, g_2 = bounded_gains(gains).unbind(1)
+        return replace(motion, gained=motion.gained + g_1 * ctx.state.velocity + (1 + g_2) * ctx.state.mean_velocity)
 
     def finish(self, step: Particles, gains: Tensor, ctx: StepContext) -> Particles:
         moved = step.means - ctx.state.means

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-LEAST_WEIGHT = 0.3  # of a node in some vertex, of the largest one of all nodes
+LEAST_WEIGHT = 0.3  # of a node in any vertex, relative to the largest of all nodes
 NEIGHBOURS = 12  # particles that a point is bound to; an affine motion needs four in general position
 
 
@@ -136,7 +136,7 @@ Embedding = ControlGrid | RigidFrame | ClothGrid | ParticleCloud
 
 
 def states(embedding: Embedding) -> np.ndarray:
-    """Nodes as float32; those of a control grid that hardly move a vertex, and might fall, go with the others."""
+    """Nodes as float32; control grid nodes with little weight in all vertices, which may fall, follow the others."""
     nodes = embedding.nodes.astype(np.float32)
     if isinstance(embedding, ControlGrid):
         binding, most = embedding.bind(embedding.vertices), np.zeros(nodes[0, ..., 0].shape)

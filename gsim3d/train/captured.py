@@ -240,7 +240,7 @@ class _Step:
         return Gradients(*done[:3])
 
     def _fitted(self, found: Sequence[tuple[int, ...]] = ()) -> tuple:
-        """Captures with room for the batch and sizes ``found``, and computes it; other threads see rounded weights."""
+        """Captures with room for the batch and sizes ``found``, and computes it; alone, as it rounds weights."""
         with self._owner.alone:
             self._grow(self._observed(), found)
             self._capture()
