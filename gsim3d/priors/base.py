@@ -116,7 +116,8 @@ class StepContext:
         self.runs = history.clouds.row_runs(self.newest)
         self.changes, self.awake, self.n_views = changes, None, None
         self._most_movable, self._share, self._shared = most_movable, share, {}
-        self._make_state = (lambda: history.select_clouds(self.newest)) if state is None else state
+        newest = self.newest  # a function that holds `self` would keep the graph of the step until garbage is collected
+        self._make_state = (lambda: history.select_clouds(newest)) if state is None else state
 
     @property
     def state(self) -> Particles:

@@ -1,6 +1,7 @@
 """Steps from a graph: on the CPU the same sums call by call, with the sizes that a graph would have."""
 
 import dataclasses
+import gc
 import itertools
 import json
 import math
@@ -14,7 +15,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from gsim3d.compat.checkpoints import OCCLUSION
-from gsim3d.cuda_graphs import Captured
+from gsim3d.cuda_graphs import Captured, collecting_nothing
 from gsim3d.data import Scene, find_scenes
 from gsim3d.errors import CaptureError, InputError
 from gsim3d.evaluate.ablations import changed, load_ablations
@@ -177,6 +178,19 @@ def test_captured_gradients_equal_autograd(phase, scenes, trainer, device):
     drawn = batches(scenes, 4, **phase)
     assert_gradients_of_the_loss(captured, drawn, trainer, device, report)
     assert captured.captures >= 1 and not report.total
+
+
+@pytest.mark.parametrize("trainer", ["latent", "moving", "all moving", "flying", "acting"], indirect=True)
+def test_autograd_graph_is_freed_with_its_loss(scenes, trainer, device):
+    """Without a garbage collection: a capture disables it, and a graph that is left breaks the capture."""
+    batch = batches(scenes, 1, horizon=2)[0].to(device)
+    gc.collect()
+    with collecting_nothing():
+        loss, errors = trainer.loss(batch)
+        torch.autograd.grad(loss, list(trainer.parameters.values()), allow_unused=True)
+        del loss, errors
+        left = [x for x in gc.get_objects() if type(x) is torch.Tensor and x.grad_fn is not None]
+    assert not left
 
 
 @pytest.mark.parametrize("trainer", ["latent"], indirect=True)
