@@ -223,6 +223,7 @@ class _Run:
         n_inputs = len(proposal["crops"]) - (held_out is not None)
         horizons = sorted({min(horizon, shortest - history) for horizon, _, _ in PHASES})
         phase = {"steps": PROBED, "batch": BATCH[device], "warm_up": 0.1}
+        phase["encoder_rate"] = DEPTH_RATE if self.depth else 1.0
         phases = [PhaseConfig(horizon=n, learning_rate=rate, **phase) for n, (*_, rate) in zip(horizons, PHASES)]
         model = {"dynamics": {"drop_path": 0.0, "shuffle_orders": False}} if device == "cuda" else {}
         model["encoder"] = {"latent_limit": 4.0}
@@ -242,7 +243,7 @@ class _Run:
                 leave_one_out=True,
             ),
             loss=LossConfig(body_weight=2.0, image_gain=True),
-            optimizer=OptimizerConfig(clip_norm=1.0, ema_decay=0.98, encoder_rate=DEPTH_RATE if self.depth else 1.0),
+            optimizer=OptimizerConfig(clip_norm=1.0, ema_decay=0.98),
             captured=device == "cuda",
         )
 

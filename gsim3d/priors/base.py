@@ -116,8 +116,7 @@ class StepContext:
         self.runs = history.clouds.row_runs(self.newest)
         self.changes, self.awake, self.n_views = changes, None, None
         self._most_movable, self._share, self._shared = most_movable, share, {}
-        newest = self.newest  # a function that holds `self` would keep the graph of the step until garbage is collected
-        self._make_state = (lambda: history.select_clouds(newest)) if state is None else state
+        self._make_state = state or (lambda newest=self.newest: history.select_clouds(newest))  # no cycle
 
     @property
     def state(self) -> Particles:

@@ -39,6 +39,7 @@ class PhaseConfig:
     begin_within: int = 0
     from_start: float = 0.0  #: fraction of the windows, 0 to 1, that start at a scene's first step
     learning_rate: float = 2e-4  #: peak learning rate of the phase's one-cycle schedule
+    encoder_rate: float = 1.0  #: learning rate of the encoder, relative to the other parts
     warm_up: float = 0.01  #: fraction of the phase's steps, 0 to 1, until the peak
 
     REMOVED: ClassVar[dict] = {"lead": 0, "lit_before": 0, "dynamics_alone": False, "masked_out": 0}
@@ -46,7 +47,7 @@ class PhaseConfig:
     def __post_init__(self):
         check_ranges(self, steps=(1, MANY), batch=(1, 10**5), target_views=(1, 10**4), learning_rate=(0, 1))
         check_ranges(self, **dict.fromkeys(("horizon", "cut", "history"), (0, 10**5)))
-        check_ranges(self, begin_within=(0, MANY), from_start=(0, 1), warm_up=(0, 1))
+        check_ranges(self, begin_within=(0, MANY), from_start=(0, 1), warm_up=(0, 1), encoder_rate=(0, 1e3))
 
 
 @dataclass(frozen=True)
@@ -148,16 +149,17 @@ class OptimizerConfig:
     eps: float = 1e-8  #: added to the root of the second moment
     weight_decay: float = 1e-3  #: decoupled weight decay, multiplied by the learning rate
     clip_norm: float = 0.5  #: largest global gradient norm; 0: no clipping
-    encoder_rate: float = 1.0  #: learning rate of the encoder, relative to the other parts
     #: decay of the exponential moving average of the weights, below 1; 0: no average. Only weights that a step updates
     #: are averaged in.
     ema_decay: float = 0.999
     #: number of consecutive steps with a loss or gradient that is not finite, after which training stops
     max_skipped: int = 20
 
+    REMOVED: ClassVar[dict] = {"encoder_rate": 1.0}
+
     def __post_init__(self):
         check_ranges(self, **dict.fromkeys(("beta1", "beta2", "ema_decay"), (0, 1)))
-        check_ranges(self, eps=(1e-12, 1), weight_decay=(0, 1e3), clip_norm=(0, 1e6), encoder_rate=(0, 1e3))
+        check_ranges(self, eps=(1e-12, 1), weight_decay=(0, 1e3), clip_norm=(0, 1e6))
         check_ranges(self, max_skipped=(1, MANY))
         for name in ("beta1", "beta2", "ema_decay"):
             if getattr(self, name) >= 1:
@@ -246,7 +248,7 @@ class TrainConfig:
 # Settings that may change when a run is resumed, without changing the results up to rounding.
 FREE_SETTINGS = ("captured", "checkpoint_every", "keep_checkpoints", "log_every", "pretrained_depth", "recompute")
 # Settings of sections that may change when a run is resumed, to recover a diverged run; they change the results.
-FREE_OF_SECTIONS = {"optimizer": ("clip_norm", "max_skipped"), "phases": ("learning_rate", "warm_up")}
+FREE_OF_SECTIONS = {"optimizer": ("clip_norm", "max_skipped"), "phases": ("learning_rate", "encoder_rate", "warm_up")}
 
 
 def check_settings(config: TrainConfig, dynamics: DynamicsConfig, plan: Plan, n_processes: int = 1) -> None:

@@ -222,7 +222,7 @@ class Trainer:
         except NumericalError as error:
             problem = str(error)
         if problem is None:
-            self.optimizer.update(gradients, norm, rate)
+            self.optimizer.update(gradients, norm, rate, phase.encoder_rate)
             if self.average:
                 decay = min(self.config.optimizer.ema_decay, (1 + self.step) / (EMA_WARM_UP + self.step))
                 update_average(self.average, self.parameters, self.buffers, gradients, decay)

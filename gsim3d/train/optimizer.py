@@ -2,7 +2,6 @@
 
 import math
 import os
-from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
@@ -26,16 +25,14 @@ class Optimizer(torch.optim.AdamW):
     count steps on the host.
 
     Args:
-        parameters: parameters by name; the learning rate of ``encoder.`` is multiplied by ``settings.encoder_rate``.
+        parameters: parameters by name; those of ``encoder.`` may have another learning rate.
         settings: hyperparameters.
     """
 
     def __init__(self, parameters: Mapping[str, nn.Parameter], settings: OptimizerConfig):
-        groups = defaultdict(list)
-        for name, parameter in parameters.items():
-            groups[settings.encoder_rate if name.startswith("encoder.") else 1.0].append(parameter)
+        parts = {part: [p for name, p in parameters.items() if name.startswith("encoder.") == part] for part in (0, 1)}
         super().__init__(
-            [{"params": members, "factor": factor} for factor, members in groups.items()],
+            [{"params": members, "encodes": part} for part, members in parts.items()],
             lr=0.0,
             betas=(settings.beta1, settings.beta2),
             eps=settings.eps,
@@ -45,11 +42,11 @@ class Optimizer(torch.optim.AdamW):
         self._limit = settings.clip_norm or math.inf
 
     @torch.no_grad()
-    def update(self, gradients: Sequence[Tensor | None], norm: Tensor, rate: float) -> None:
-        """Performs one update at learning ``rate`` with ``gradients`` in the order of the parameters (clipped in place;
-        None leaves one unchanged), whose global ``norm`` is a scalar tensor."""
+    def update(self, gradients: Sequence[Tensor | None], norm: Tensor, rate: float, encoder_rate: float = 1.0) -> None:
+        """Performs one update at learning ``rate``, times ``encoder_rate`` for the encoder, with ``gradients`` in the
+        order of the parameters (clipped in place; None: unchanged), whose global ``norm`` is a scalar tensor."""
         for group in self.param_groups:
-            group["lr"] = rate * group["factor"]
+            group["lr"] = rate * encoder_rate if group["encodes"] else rate
         if norm.is_cuda:
             self._update_on_gpu(gradients, norm)
             return

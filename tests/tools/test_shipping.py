@@ -24,7 +24,7 @@ from tools.release.trajectories import TrajectoryStore
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 ROOT = Path(__file__).parent.parent.parent
-NAME, RUN = "elastic-small", "elastic-pure"
+NAME, RUN = "elastic-small", "elastic-velocity"
 OPTIONS = {"image_size": 32, "n_frames": 6, "objects": ("ball",)}
 CONFIG = TrainConfig(
     phases=(PhaseConfig(steps=9, horizon=1, target_views=2),),

@@ -168,7 +168,7 @@ def test_workers_give_the_gradient_of_the_whole_batch(folder, tmp_path):
     gradients = []
     for workers in (0, 1):
         trainer = Trainer(dataclasses.replace(CONFIG, workers=workers), scenes(folder), tmp_path)
-        trainer.optimizer.update = lambda found, norm, rate: gradients.append(found)
+        trainer.optimizer.update = lambda found, *_: gradients.append(found)
         trainer.train_step()
     for whole, split in zip(*gradients, strict=True):
         assert (whole is None) == (split is None)

@@ -10,7 +10,8 @@ from torch import nn
 from gsim3d.train.config import OptimizerConfig
 from gsim3d.train.optimizer import Optimizer
 
-CONFIG = OptimizerConfig(beta1=0.8, beta2=0.95, weight_decay=0.1, clip_norm=0.5, encoder_rate=0.3)
+CONFIG = OptimizerConfig(beta1=0.8, beta2=0.95, weight_decay=0.1, clip_norm=0.5)
+ENCODER_RATE = 0.3
 RATES = (1e-2, 3e-2, 1e-3, 2e-2)
 
 
@@ -18,9 +19,9 @@ RATES = (1e-2, 3e-2, 1e-3, 2e-2)
 def step_of(request):
     """How an optimizer makes a step; without a GPU, that of a GPU too."""
 
-    def on_gpu(optimizer, gradients, norm, rate):
+    def on_gpu(optimizer, gradients, norm, rate, encoder_rate):
         for group in optimizer.param_groups:
-            group["lr"] = rate * group["factor"]
+            group["lr"] = rate * encoder_rate if group["encodes"] else rate
         with torch.no_grad():
             optimizer._update_on_gpu(gradients, norm)
 
@@ -48,7 +49,7 @@ def draw(parameters, k):
 
 def take(optimizer, gradients, rate, step_of):
     norm = torch.nn.utils.get_total_norm([gradient for gradient in gradients if gradient is not None])
-    step_of(optimizer, gradients, norm, rate)
+    step_of(optimizer, gradients, norm, rate, ENCODER_RATE)
 
 
 def moments(optimizer, parameters):
@@ -69,7 +70,7 @@ def test_optimizer_step_equals_torch(clip_norm, step_of, device):
             p.grad = None if gradient is None else gradient.clone()
         if clip_norm:
             torch.nn.utils.clip_grad_norm_(theirs, clip_norm)
-        plain.param_groups[0]["lr"], plain.param_groups[1]["lr"] = 0.3 * rate, rate
+        plain.param_groups[0]["lr"], plain.param_groups[1]["lr"] = ENCODER_RATE * rate, rate
         plain.step()
         take(optimizer, gradients, rate, step_of)
         for p, expected, gradient, (value, version) in zip(ours, theirs, gradients, before, strict=True):
@@ -104,5 +105,11 @@ def test_optimizer_restores_the_same_bits(step_of, device):
 def test_optimizer_without_gradients_changes_nothing(step_of, device):
     parameters = list(model(device).parameters())
     before = [p.detach().clone() for p in parameters]
-    step_of(Optimizer(named(parameters), CONFIG), [None] * len(parameters), torch.zeros((), device=device), 0.1)
+    step_of(
+        Optimizer(named(parameters), CONFIG),
+        [None] * len(parameters),
+        torch.zeros((), device=device),
+        0.1,
+        ENCODER_RATE,
+    )
     assert all(torch.equal(p, value) for p, value in zip(parameters, before, strict=True))

@@ -1,7 +1,7 @@
 #!/usr/bin/env python
 """Prints what the states of runs say: validation scores against windows, and paired differences between arms.
 
-    python tools/release/curve.py tools/release/state/elastic-pure.state.safetensors [OTHER.state.safetensors ...]
+    python tools/release/curve.py tools/release/state/elastic-velocity.state.safetensors [OTHER.state.safetensors ...]
 
 Scores are masked PSNR [dB] of validation trajectories: given steps, future steps over the full horizon, bodies in
 future steps, and the last given step held still. Differences are those of the first state's newest score and every

@@ -1,4 +1,4 @@
-"""Recipes of the simulators that are trained for release: configs/train/WORLD.yaml, and arms with priors beside it."""
+"""Recipes of the simulators that are trained for release: configs/train/WORLD.yaml, and arms beside it."""
 
 import dataclasses
 from dataclasses import dataclass, field
@@ -40,7 +40,7 @@ class Recipe:
         return {"world": self.world, "preset": self.preset, **given}
 
 
-def recipe(world: str, arm: str = "pure") -> Recipe:
+def recipe(world: str, arm: str = "velocity") -> Recipe:
     """The recipe of ``arm`` in ``world``.
 
     Raises:

@@ -2,7 +2,7 @@
 """Puts a trained simulator into the package, with its model card.
 
     python tools/release/train.py elastic --minutes 22 --state runs/elastic --out runs/elastic
-    python tools/release/score.py elastic-small --checkpoint runs/elastic/elastic-pure.weights.safetensors \
+    python tools/release/score.py elastic-small --checkpoint runs/elastic/elastic-velocity.weights.safetensors \
         --data runs/held_out --out runs/scores
     python tools/release/ship_model.py elastic-small --state runs/elastic --scores runs/scores --limitations LIST.md
     python tools/release/ship_model.py      # updates the invariances in all cards, and the curves in docs/results
@@ -194,7 +194,7 @@ def update_cards() -> None:
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("name", nargs="?", help="such as elastic-small (left out: only the cards are updated)")
-    parser.add_argument("--arm", default="pure", help="of the recipe (default: pure)")
+    parser.add_argument("--arm", default="velocity", help="of the recipe (default: velocity)")
     parser.add_argument("--state", type=Path, help="what tools/release/train.py wrote")
     parser.add_argument("--scores", type=Path, help="what score.py wrote")
     parser.add_argument("--limitations", type=Path, help="markdown list (default: that of the present card)")

@@ -1,7 +1,7 @@
 #!/usr/bin/env python
 """Trains a simulator for release: one run of given length, while its trajectories are simulated.
 
-    python tools/release/train.py elastic --arm pure --minutes 22 --state runs/elastic --out runs/elastic
+    python tools/release/train.py elastic --minutes 22 --state runs/elastic --out runs/elastic
     torchrun --nproc-per-node 4 tools/release/train.py elastic --minutes 22 --state ... --out ...    # on 4 GPUs
 
 Data workers simulate trajectories on all spare cores; training begins with the first of them. Called again, the next
@@ -146,7 +146,7 @@ def say(text: str) -> None:
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0], allow_abbrev=False)
     parser.add_argument("world", choices=("elastic", "cloth", "rigid", "push"))
-    parser.add_argument("--arm", default="pure", help="of configs/train/arms.yaml (default: pure)")
+    parser.add_argument("--arm", default="velocity", help="of configs/train/arms.yaml (default: velocity)")
     parser.add_argument("--minutes", type=float, required=True, help="length of this run, everything included")
     parser.add_argument("--state", type=Path, required=True, help="folder with the state of the last run, if any")
     parser.add_argument("--out", type=Path, required=True, help="folder for the state and the video; may be the same")
