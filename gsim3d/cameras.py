@@ -25,8 +25,8 @@ class TensorRecord:
         return dataclasses.replace(self, **tensors, **records)
 
     def to(self, device: str | torch.device) -> Self:
-        """Returns a copy on ``device``."""
-        return self.map(lambda t: t.to(device))
+        """Returns a copy on ``device``; pinned memory is copied without waiting."""
+        return self.map(lambda t: t.to(device, non_blocking=t.is_pinned()))
 
     def detach(self) -> Self:
         """Returns a copy detached from the autograd graph."""

@@ -221,11 +221,9 @@ class _Step:
         self._owner, self._capacities, self._is_ready = owner, [], False
         self.particles, self.moving = particles, moving
         self._graph = self._records = None
-        batch, self._clouds = prepared.batch, prepared.kind[:2]
-        self._context, self._targets = batch.context.map(torch.clone), batch.targets.map(torch.clone)
-        self._shapes = owner.simulator.encoder.static_shapes(batch.context, particles)
-        self._noise = None if batch.noise is None else batch.noise.clone()
-        self._n_future, self._cut, self._weights = batch.n_future, batch.cut, weights.clone()
+        self._batch, self._clouds = prepared.batch.map(torch.clone), prepared.kind[:2]
+        self._shapes = owner.simulator.encoder.static_shapes(prepared.batch.context, particles)
+        self._weights = weights.clone()
 
     def __call__(self, prepared: Prepared, weights: Tensor, report: StabilityReport) -> Gradients:
         self._load(prepared, weights)
@@ -264,8 +262,8 @@ class _Step:
                 return owner.simulator.encode(context, shapes=self._shapes, report=report)
 
         with owner.precision("encoder"):
-            state = owner.again("encoder")(encode)(self._context)
-        return with_views(state, self._context, self._shapes) if owner.leaves_out else state
+            state = owner.again("encoder")(encode)(self._batch.context)
+        return with_views(state, self._batch.context, self._shapes) if owner.leaves_out else state
 
     def _segments(
         self,
@@ -276,20 +274,20 @@ class _Step:
     ) -> Iterator[list[Particles]]:
         """Yields the simulated steps of each segment; ``wrap`` as in Simulator.rollout."""
         owner, plan = self._owner, self._owner.plan
-        if self._n_future and plan.spec.dynamics.background == "masked_out":
+        if self._batch.n_future and plan.spec.dynamics.background == "masked_out":
             left_out, plan = state.activity != DYNAMIC, of_prepared_state(plan)  # the number of particles stays
             hidden = {"activity": torch.where(left_out, ASLEEP, state.activity)}
             state = dataclasses.replace(state, opacities=torch.where(left_out, 0.0, state.opacities), **hidden)
-        elif self._n_future:
+        elif self._batch.n_future:
             state = owner.simulator._prepare(state, plan)
-        state = displaced(state, self._noise, owner.simulator.config.dynamics.grid_size)
+        state = displaced(state, self._batch.noise, owner.simulator.config.dynamics.grid_size)
 
         def rollout(state: Particles, n_steps: int) -> list[Particles]:
             given = {"geometry": geometry, "report": report, "on_invalid": "drop", "wrap": wrap}
             with owner.precision("dynamics"):
                 return owner.simulator.rollout(state, n_steps, plan=plan, **given)
 
-        return in_segments(rollout, state, self._n_future, self._cut)
+        return in_segments(rollout, state, self._batch.n_future, self._batch.cut)
 
     def _compute(self, geometry: Callable[[Particles], Pyramid], report: StabilityReport) -> tuple:
         owner, dynamics, of_calls, n_calls = self._owner, self._owner.simulator.dynamics, [], itertools.count(1)
@@ -315,7 +313,7 @@ class _Step:
         begin, steps = 0, [state, *next(segments, [])]
         while steps:
             particles = concatenate(steps)
-            end = begin + particles.n_clouds // len(self._targets.origin)
+            end = begin + particles.n_clouds // len(self._batch.targets.origin)
             loss, wrong = self._loss(particles, begin, end, report)
             gradients = torch.autograd.grad(loss, [*once, *chain.from_iterable(of_calls)], allow_unused=True)
             n = len(total) - len(once)
@@ -345,7 +343,7 @@ class _Step:
                 lambda p, cameras, valid: owner.simulator._draw(p, cameras, active=valid, **shown).color
             )
             if owner.leaves_out:
-                images = draw_left_out(draw, particles, targets, images_per_cloud(self._context))
+                images = draw_left_out(draw, particles, targets, images_per_cloud(self._batch.context))
             else:
                 images = draw(particles, targets.cameras, targets.valid)
             alone = draw_alone(draw, particles, targets) if owner.bodies else None
@@ -354,7 +352,7 @@ class _Step:
 
     def _targets_of(self, begin: int, end: int) -> Frames:
         """The target images of the steps from ``begin`` to ``end`` of each scene's window."""
-        targets, n_steps = self._targets, len(self._weights)
+        targets, n_steps = self._batch.targets, len(self._weights)
         if end - begin == n_steps:
             return targets
         number = torch.arange(len(targets.cameras), device=self._weights.device)
@@ -375,7 +373,7 @@ class _Step:
             needed.append(PyramidCapacity.of(pyramid, pyramid.stages[0].n_rows, 1))
             return pyramid
 
-        if self._n_future:
+        if self._batch.n_future:
             with dynamics.moving_at_most(self.moving):
                 list(self._segments(self._encode(StabilityReport()), geometry, StabilityReport()))
         return needed
@@ -413,11 +411,7 @@ class _Step:
         """Copies a batch into the static input tensors of the graph."""
         self._shapes.copy_(prepared.shapes)
         self._weights.copy_(weights)
-        batch = prepared.batch
-        if batch.noise is not None:
-            self._noise.copy_(batch.noise)
-        for own, given in ((self._context, batch.context), (self._targets, batch.targets)):
-            _copy(own, given)
+        _copy(self._batch, prepared.batch)
 
 
 class _OfCalls:

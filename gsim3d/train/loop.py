@@ -370,7 +370,8 @@ class Trainer:
 
     def _draw(self, step: int, samples: Sequence[int]) -> Batch:
         phase, _ = self.config.phase_of(step)
-        return draw_batch(self.scenes, self.config.data, phase, self.config.seed, step, samples)
+        batch = draw_batch(self.scenes, self.config.data, phase, self.config.seed, step, samples)
+        return batch.map(Tensor.pin_memory) if self.device == "cuda" else batch
 
     def loss(self, batch: Batch, sample: int = 0, watch: StepWatch | None = None) -> tuple[Tensor, Tensor]:
         """Computes the loss of a batch and the unweighted mean squared error of each step; ``sample`` seeds noise."""

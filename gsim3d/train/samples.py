@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsim3d.cameras import Frames
+from gsim3d.cameras import Frames, TensorRecord
 from gsim3d.data import Scene, Window, generator, make_frames
 from gsim3d.data.fitting import frame_stride
 from gsim3d.effects.spec import EffectsSpec, Sleep
@@ -26,7 +26,7 @@ READERS = 2  # threads that read batches, and number of batches read ahead
 
 
 @dataclass(frozen=True)
-class Batch:
+class Batch(TensorRecord):
     """Windows of B scenes, each of n_context + n_future steps."""
 
     context: Frames  #: input images of the first n_context steps of each window
@@ -35,10 +35,6 @@ class Batch:
     n_future: int  #: number of simulated steps
     cut: int = 0  #: see :class:`gsim3d.train.config.PhaseConfig`
     noise: Tensor | None = None  #: result of :func:`draw_noise`
-
-    def to(self, device: str | torch.device) -> Batch:
-        noise = None if self.noise is None else self.noise.to(device)
-        return dataclasses.replace(self, context=self.context.to(device), targets=self.targets.to(device), noise=noise)
 
 
 class BatchReader:
