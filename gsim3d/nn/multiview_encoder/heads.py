@@ -66,6 +66,8 @@ class Conditioning(nn.Module):
         """x [I, F, H, W]; depth and opacity_logit [I, 1, H, W]; raw_offset [I, 2, H, W]; rays [I, 6, H, W]."""
         seen = for_convolution(torch.cat([depth, opacity_logit, raw_offset, rays], 1))
         scale, shift = self.net(seen).chunk(2, 1)
+        if scale.is_cpu:  # where torch computes the softplus of strided numbers one by one
+            scale = scale.contiguous(memory_format=torch.channels_last)
         return x * (1 + F.softplus(scale)) + shift
 
 
