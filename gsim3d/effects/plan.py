@@ -107,10 +107,12 @@ def unused_parameters(plan: Plan, model: ModelConfig, names: Iterable[str]) -> t
     config = model.dynamics
     # With slots counted from the newest step, all tables of time embeddings are used.
     bits = config.history_bits if config.slots_from_newest else (plan.history - 1).bit_length()
-    merged = config.pyramid_spec(bits).merged_bits()
-    tables = {f"dynamics.net.encoder.{s}.merge.time_embedding" for s, n in enumerate(merged) if n == 0}
-    without_actions = not plan.spec.dynamics.actions
-    return tuple(n for n in names if n in tables or without_actions and n.startswith("dynamics.actions."))
+    merged = zip(config.pyramid_spec(bits).merged_bits()[1:], config.merge_windows)
+    stages = [s for s, (n, window) in enumerate(merged, 1) if n == 0 and window > 1]
+    unread = [f"dynamics.net.encoder.{s}.merge.time_embedding" for s in stages]
+    if config.actions and not plan.spec.dynamics.actions:
+        unread.append("dynamics.actions.")
+    return tuple(n for n in names if n.startswith(tuple(unread))) if unread else ()
 
 
 def by_plan(particles: Particles, plans: Sequence[Plan]) -> Iterator[tuple[Plan, list[int]]]:
