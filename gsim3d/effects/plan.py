@@ -108,10 +108,8 @@ def unused_parameters(plan: Plan, model: ModelConfig, names: Iterable[str]) -> t
     # With slots counted from the newest step, all tables of time embeddings are used.
     bits = config.history_bits if config.slots_from_newest else (plan.history - 1).bit_length()
     merged = zip(config.pyramid_spec(bits).merged_bits()[1:], config.merge_windows)
-    stages = [s for s, (n, window) in enumerate(merged, 1) if n == 0 and window > 1]
-    unread = [f"dynamics.net.encoder.{s}.merge.time_embedding" for s in stages]
-    if config.actions and not plan.spec.dynamics.actions:
-        unread.append("dynamics.actions.")
+    unread = [f"dynamics.net.encoder.{s}.merge" for s, (n, window) in enumerate(merged, 1) if n == 0 and window > 1]
+    unread += ["dynamics.actions."] * bool(config.actions and not plan.spec.dynamics.actions)
     return tuple(n for n in names if n.startswith(tuple(unread))) if unread else ()
 
 

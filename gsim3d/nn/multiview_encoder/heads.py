@@ -134,15 +134,13 @@ class ParticleHeads(nn.Module):
         pixel_size = geometry.inverse_Ks[:, :2, :2].sum((1, 2)).to(raw.dtype)[:, None, None]
         scales = (smallest + (largest - smallest) * raw_scales.sigmoid()) * (_rows(depth) * 0.1 * pixel_size)
         rotations = geometry.rotations.to(raw.dtype)
-        turn = rotation_to_quat(rotations)[:, None]
-        quats = quat_product(turn, unit_quats(raw_quats.roll(1, -1)))  # raw: real part last
+        quats = quat_product(rotation_to_quat(rotations)[:, None], unit_quats(raw_quats.roll(1, -1)))  # raw: w last
         quats = with_positive_largest(quats)  # as those that the dynamics writes and reads
         damping = degree_damping(self.config.sh_degree, raw)
         in_camera = raw_sh.reshape(n_images, -1, 3, damping.shape[0]) * damping
         each = torch.eye(len(damping), dtype=geometry.rotations.dtype, device=raw.device).repeat(n_images, 1, 1)
-        turn_sh = self.rotate_harmonics(each, geometry.rotations)
-        turned = torch.einsum("ikl,incl->inkc", turn_sh.to(raw.dtype), in_camera)
-        return {"quats": quats, "scales": scales, "sh": turned}
+        sh = self.rotate_harmonics(each, geometry.rotations).to(raw.dtype)
+        return {"quats": quats, "scales": scales, "sh": torch.einsum("ikl,incl->inkc", sh, in_camera)}
 
     def rotate_harmonics(self, sh: Tensor, rotations: Tensor) -> Tensor:
         """Predicted coefficients [N, K, C] turned into the world by ``rotations`` [N, 3, 3]."""
