@@ -39,7 +39,6 @@ from gsim3d.simulator import Simulator
 from gsim3d.state import ASLEEP, DYNAMIC, Particles, concatenate
 from gsim3d.train.gradients import in_segments, recomputing
 from gsim3d.train.left_out import draw_left_out, images_per_cloud, with_views
-from gsim3d.train.losses import draw_alone
 from gsim3d.train.samples import Batch, displaced
 
 # Capacity of geometry and clouds over the largest size so far: smaller causes more captures, larger makes steps slower.
@@ -90,14 +89,12 @@ class CapturedLoss:
     Args:
         simulator: model to train, without drop path and shuffled curves, whose random draws a graph would repeat.
         plan: plan of the training.
-        loss: function (images [I, H, W, 3], targets, weights of the steps, images of bodies alone or None) -> loss and
-            errors by step.
+        loss: function (images [I, H, W, 3], targets, weights of the steps) -> loss and errors by step.
         precision: function that returns the autocast context of a part ("encoder", "dynamics", "renderer").
         recompute: see TrainConfig.
         leaves_out: see ``leave_one_out`` of DataConfig.
         whole: the loss compares images of different steps. Otherwise each segment of a rollout (``Batch.cut``) has its
             backward pass before the next one begins, which frees its activations.
-        bodies: the loss compares images of bodies alone.
 
     Attributes:
         parameters: all parameters of the simulator, in the order of the gradients returned.
@@ -113,17 +110,16 @@ class CapturedLoss:
         self,
         simulator: Simulator,
         plan: Plan,
-        loss: Callable[[Tensor, Frames, Tensor, Tensor | None], tuple[Tensor, Tensor]],
+        loss: Callable[[Tensor, Frames, Tensor], tuple[Tensor, Tensor]],
         precision: Callable[[str], torch.autocast],
         recompute: Collection[str] = (),
         leaves_out: bool = False,
         whole: bool = False,
-        bodies: bool = False,
     ):
         check_capturable(simulator.config.dynamics)
         self.simulator, self.plan, self.loss, self.precision = simulator, plan, loss, precision
         self.again, self.leaves_out = recomputing(recompute, simulator), leaves_out
-        self.whole, self.bodies = whole, bodies
+        self.whole = whole
         self.parameters = list(simulator.parameters())
         self.alone: AbstractContextManager = nullcontext()
         self.meanwhile: Callable[[], None] = lambda: None
@@ -346,9 +342,8 @@ class _Step:
                 images = draw_left_out(draw, particles, targets, images_per_cloud(self._batch.context))
             else:
                 images = draw(particles, targets.cameras, targets.valid)
-            alone = draw_alone(draw, particles, targets) if owner.bodies else None
         report.close()
-        return owner.loss(images, targets, self._weights[begin:end], alone)
+        return owner.loss(images, targets, self._weights[begin:end])
 
     def _targets_of(self, begin: int, end: int) -> Frames:
         """The target images of the steps from ``begin`` to ``end`` of each scene's window."""

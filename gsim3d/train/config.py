@@ -124,9 +124,6 @@ class LossConfig:
     balance: float = 0.5
     discount: float = 0.87  #: weight of a simulated step relative to the previous one, 0 to 1 (gamma of the paper)
     body_weight: float = 0.0  #: weight added to pixels of movable bodies; other pixels have weight 1
-    #: weight of the error of images of movable bodies alone, where all else is black: the only loss of particles that
-    #: the background hides. For scenes with masks in which nothing hides a body.
-    bodies: float = 0.0
     #: weight of LPIPS (VGG), added to the squared error; 0.05 in the paper, 0.01 for its rigid bodies. Install its
     #: weights with `gsim3d weights lpips`.
     perceptual: float = 0.0
@@ -134,10 +131,10 @@ class LossConfig:
     #: to the mean gain of the batch, for cameras that differ in exposure or white balance
     image_gain: bool = False
 
-    REMOVED: ClassVar[dict] = {"shape": 0, "shape_length": ...}
+    REMOVED: ClassVar[dict] = {"shape": 0, "shape_length": ..., "bodies": 0}
 
     def __post_init__(self):
-        check_ranges(self, balance=(0, 1), discount=(0, 1), body_weight=(0, 1e6), bodies=(0, 1e6), perceptual=(0, 1e6))
+        check_ranges(self, balance=(0, 1), discount=(0, 1), body_weight=(0, 1e6), perceptual=(0, 1e6))
 
 
 @dataclass(frozen=True)
@@ -258,8 +255,6 @@ def check_settings(config: TrainConfig, dynamics: DynamicsConfig, plan: Plan, n_
             raise InputError(f"data.history: {history} steps, but this model takes at most {plan.history}")
     if config.data.unfrozen_background and not dynamics.is_asymmetric:
         raise InputError('data.unfrozen_background: requires a model with background "asymmetric"')
-    if config.loss.bodies and (config.data.leave_one_out or plan.spec.dynamics.background == "dynamic"):
-        raise InputError("loss.bodies: requires a static background and data.leave_one_out: false")
     if config.workers and dynamics.norm == "batch":
         raise InputError("workers: must be 0 for a model with batch normalisation, which needs all samples at once")
     if config.captured and config.workers:

@@ -39,7 +39,7 @@ from gsim3d.train.gradients import (
 )
 from gsim3d.train.left_out import draw_left_out, images_per_cloud, with_views
 from gsim3d.train.log import Log, Sample, draw_sample, memory_gib, plain, profiler, progress_note, sample_video
-from gsim3d.train.losses import draw_alone, time_weights, training_loss
+from gsim3d.train.losses import time_weights, training_loss
 from gsim3d.train.optimizer import FIRST_SCALE, LossScale, Optimizer, deterministic, one_cycle, update_average
 from gsim3d.train.processes import Processes
 from gsim3d.train.restore import build_simulator, describe, keep_jacobian, model_config
@@ -127,7 +127,7 @@ class Trainer:
 
     def _capture(self) -> CapturedLoss:
         precision, loss = partial(self.config.precision.of, device=self.device), self.config.loss
-        parts = self.config.recompute, self.config.data.leave_one_out, loss.image_gain, loss.bodies > 0
+        parts = self.config.recompute, self.config.data.leave_one_out, loss.image_gain
         return CapturedLoss(self.simulator, self.plan, self.loss_of_images, precision, *parts)
 
     # ---- the loop ----
@@ -375,8 +375,8 @@ class Trainer:
 
     def loss(self, batch: Batch, sample: int = 0, watch: StepWatch | None = None) -> tuple[Tensor, Tensor]:
         """Computes the loss of a batch and the unweighted mean squared error of each step; ``sample`` seeds noise."""
-        images, alone = self._images(batch, sample, watch or StepWatch())
-        return self.loss_of_images(images, batch.targets, self.step_weights(batch), alone)
+        images = self._images(batch, sample, watch or StepWatch())
+        return self.loss_of_images(images, batch.targets, self.step_weights(batch))
 
     def step_weights(self, batch: Batch) -> Tensor:
         """Returns the weight [S] of each step of a batch."""
@@ -384,9 +384,8 @@ class Trainer:
         weights = time_weights(batch.n_context, batch.n_future, balance=settings.balance, discount=settings.discount)
         return weights.to(self.device)
 
-    def _images(self, batch: Batch, sample: int, watch: StepWatch) -> tuple[Tensor, Tensor | None]:
-        """Predicts the images of the target cameras of a batch, each part of the model in its precision, and those of
-        bodies alone if the loss compares them."""
+    def _images(self, batch: Batch, sample: int, watch: StepWatch) -> Tensor:
+        """Predicts the images of the target cameras of a batch, each part of the model in its precision."""
         simulator, precision = self.simulator, self.config.precision
         again = recomputing(self.config.recompute, simulator)
         options = {"report": watch.report, "on_invalid": "drop" if watch.strict else None}
@@ -418,9 +417,8 @@ class Trainer:
                 images = draw_left_out(render, particles, batch.targets, images_per_cloud(batch.context))
             else:
                 images = render(particles, batch.targets.cameras, batch.targets.valid)
-            alone = draw_alone(render, particles, batch.targets) if self.config.loss.bodies else None
         watch.report.close()  # recomputation in the backward pass must not count again
-        return images, alone
+        return images
 
     def draw_sample(self, scene: Scene | None = None) -> Sample:
         """Predicts the first window of ``scene`` (default: the first scene) with the current weights."""

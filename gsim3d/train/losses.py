@@ -1,15 +1,10 @@
 """The training loss: image errors weighted over time."""
 
-import dataclasses
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
-from gsim3d.cameras import Cameras, Frames
-from gsim3d.errors import InputError
+from gsim3d.cameras import Frames
 from gsim3d.evaluate.perceptual.lpips import LPIPS
-from gsim3d.state import FROZEN, Particles
 from gsim3d.train.config import LossConfig
 
 MAX_GAIN = 1.5
@@ -17,12 +12,7 @@ LEAST_WEIGHT = 1e-12  # lower bound of the total pixel weight of an image, so th
 
 
 def training_loss(
-    settings: LossConfig,
-    perceptual: LPIPS | None,
-    images: Tensor,
-    targets: Frames,
-    weights: Tensor,
-    alone: Tensor | None = None,
+    settings: LossConfig, perceptual: LPIPS | None, images: Tensor, targets: Frames, weights: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Computes the loss, and the unweighted mean squared error of each step.
 
@@ -32,9 +22,6 @@ def training_loss(
         images: [I, H, W, 3], rendered images of the target cameras.
         targets: ground truth; image i shows step ``image_cloud[i] % S``.
         weights: [S], from :func:`time_weights`.
-        alone: [I, H, W, 3], those of bodies alone, from :func:`draw_alone`, if ``settings.bodies`` is not 0.
-    Raises:
-        InputError: ``alone`` is given, but the targets have no masks.
     """
     n_steps, truth, shown = weights.shape[0], targets.images.permute(0, 2, 3, 1), targets.dynamic
     weight = 1 + settings.body_weight * shown if settings.body_weight and shown is not None else None
@@ -47,22 +34,9 @@ def training_loss(
     if perceptual is not None:
         seen = images if targets.valid is None else torch.where(targets.valid[..., None], images, truth)
         wrong = wrong + settings.perceptual * perceptual(seen.permute(0, 3, 1, 2), targets.images)
-    if alone is not None:
-        if shown is None:
-            raise InputError("loss.bodies: requires scenes with masks of the movable bodies")
-        wrong = wrong + settings.bodies * image_errors(alone, truth * shown[..., None], weight)
     with torch.no_grad():
         errors = mean_by_step(image_errors(images, truth, targets.valid), step, n_steps)
     return image_loss(wrong, step, weights), errors
-
-
-def draw_alone(
-    draw: Callable[[Particles, Cameras, Tensor | None], Tensor], particles: Particles, targets: Frames
-) -> Tensor:
-    """Draws the images [I, H, W, 3] of the cameras of ``targets`` without frozen particles, by ``draw`` as of
-    :func:`gsim3d.train.left_out.draw_left_out`."""
-    opacities = particles.opacities.masked_fill(particles.activity == FROZEN, 0)
-    return draw(dataclasses.replace(particles, opacities=opacities), targets.cameras, targets.valid)
 
 
 def time_weights(n_past: int, n_future: int, *, balance: float = 0.5, discount: float = 0.87) -> Tensor:

@@ -22,7 +22,7 @@ from gsim3d.evaluate.ablations import changed, load_ablations
 from gsim3d.numerics.report import StabilityReport
 from gsim3d.train import captured as captured_module
 from gsim3d.train.captured import CapturedLoss
-from gsim3d.train.config import DataConfig, LossConfig, PhaseConfig, TrainConfig
+from gsim3d.train.config import DataConfig, PhaseConfig, TrainConfig
 from gsim3d.train.loop import Trainer, deterministic
 from gsim3d.train.samples import draw_batch
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
@@ -97,7 +97,6 @@ ALL_MOVING = dataclasses.replace(
 )
 ACTING = dataclasses.replace(
     CONFIG,
-    loss=LossConfig(bodies=0.5),
     model={"dynamics": {"actions": ["hand", "pusher"], "background": "relightable", "priors": [{"type": "velocity"}]}},
     effects={"dynamics": {"actions": ["hand", "pusher"]}},
 )
@@ -132,7 +131,6 @@ def captured_loss(trainer, recompute=()):
         trainer.loss_of_images,
         lambda part: torch.autocast("cpu", enabled=False),
         recompute=recompute,
-        bodies=trainer.config.loss.bodies > 0,
     )
 
 

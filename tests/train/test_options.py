@@ -16,11 +16,10 @@ from gsim3d.errors import InputError
 from gsim3d.io import checkpoint
 from gsim3d.io.settings import from_dict
 from gsim3d.state import DYNAMIC, FROZEN
-from gsim3d.train.config import DataConfig, LossConfig, PhaseConfig, PrecisionConfig
+from gsim3d.train.config import DataConfig, PhaseConfig, PrecisionConfig
 from gsim3d.train.gradients import StepWatch
 from gsim3d.train.log import sample_video
 from gsim3d.train.loop import Trainer, deterministic
-from gsim3d.train.losses import draw_alone, image_errors, image_loss
 from gsim3d.train.optimizer import STEPS_TO_DOUBLE, LossScale
 from gsim3d.train.samples import displaced, draw_batch, draw_noise, draw_windows
 from gsim3d.viewer import training
@@ -99,7 +98,7 @@ def test_states_and_images_stay_float32(folder, tmp_path, precision, device):
     trainer = trainer_at(folder, tmp_path, device=device, precision=precision)
     render, seen = trainer.simulator.render, []
     trainer.simulator.render = lambda p, *given, **options: seen.append(p) or render(p, *given, **options)
-    images, _ = trainer._images(trainer._batch([0]), 0, StepWatch())
+    images = trainer._images(trainer._batch([0]), 0, StepWatch())
     (particles,) = seen
     floats = [value for value in particles.row_fields().values() if value.is_floating_point()]
     assert len(floats) == 4 and particles.n_clouds == 4
@@ -330,7 +329,7 @@ def test_cut_bounds_steps_of_gradients(folder, tmp_path):
         phase = dataclasses.replace(CONFIG.phases[1], horizon=4, cut=cut, from_start=1.0)
         batch, watch = draw_batch(trainer.scenes, CONFIG.data, phase, 0, LATER, [0]), StepWatch()
         trainer.step = 0  # one that is logged
-        images, _ = trainer._images(batch, 0, watch)
+        images = trainer._images(batch, 0, watch)
         errors = (images - batch.targets.images.permute(0, 2, 3, 1)).square()
         errors[batch.targets.cameras.image_cloud == batch.n_context + 3].mean().backward()
         reached[cut] = [norm > 0 for norm in watch.norms()]
@@ -338,55 +337,3 @@ def test_cut_bounds_steps_of_gradients(folder, tmp_path):
     assert reached[1] == [False, False, False, True]
     assert reached[2] == [False, False, True, True]
     assert reached[3] == [False, False, False, True]  # three steps, then one
-
-
-def test_bodies_alone_hold_particles_that_the_background_hides(folder, tmp_path):
-    """A movable particle behind frozen ones: the whole image has no gradient for it, that of bodies alone has."""
-    trainer = trainer_at(folder, tmp_path / "a", loss=LossConfig(bodies=2.0))
-    frames = trainer._batch([0]).context
-    state = trainer.simulator.encode(frames)
-    viewmat, means = frames.cameras.viewmats[0], state.means.detach().clone()
-    eye, hidden = -(viewmat[:3, :3].mT @ viewmat[:3, 3]), means[state.activity == DYNAMIC][0]
-    wall = hidden + 0.3 * torch.nn.functional.normalize(eye - hidden, dim=0)
-    row, frozen = int((state.activity == DYNAMIC).nonzero()[0]), (state.activity == FROZEN).nonzero()[:, 0]
-    means[frozen] = wall
-    opacities = torch.full_like(state.opacities, 0.999).requires_grad_()
-    state = dataclasses.replace(state, means=means, opacities=opacities)
-
-    def render(particles, cameras, valid):
-        return trainer.simulator.render(particles, cameras, plan=trainer.plan, active=valid).color
-
-    whole, alone = render(state, frames.cameras, None), draw_alone(render, state, frames)
-    gradients = [torch.autograd.grad(images[0].sum(), opacities, retain_graph=True)[0] for images in (whole, alone)]
-    assert gradients[1][row].abs() > 100 * gradients[0][row].abs()
-    assert not gradients[1][frozen].any()
-
-
-def test_loss_of_bodies_is_added(folder, tmp_path):
-    plain, both = (
-        trainer_at(folder, tmp_path / str(bodies), loss=LossConfig(bodies=bodies, balance=0.3)) for bodies in (0.0, 2.0)
-    )
-    both.simulator.load_state_dict(plain.simulator.state_dict())
-    batch = plain._batch([0])
-    (loss, errors), (more, same) = plain.loss(batch), both.loss(batch)
-    assert (
-        torch.equal(errors, same)
-        and both._images(batch, 0, StepWatch())[1].shape == batch.targets.images.permute(0, 2, 3, 1).shape
-    )
-    _, alone = both._images(batch, 0, StepWatch())
-    wrong = image_errors(alone, batch.targets.images.permute(0, 2, 3, 1) * batch.targets.dynamic[..., None])
-    step = batch.targets.cameras.image_cloud % len(errors)
-    assert (more - loss).item() == pytest.approx(
-        2 * image_loss(wrong, step, plain.step_weights(batch)).item(), rel=1e-4
-    )
-    with pytest.raises(InputError, match="loss.bodies: requires scenes with masks"):
-        both.loss(dataclasses.replace(batch, targets=dataclasses.replace(batch.targets, dynamic=None)))
-
-
-@pytest.mark.parametrize(
-    "settings", [{"data": {"leave_one_out": True}}, {"effects": {"dynamics": {"background": "dynamic"}}}]
-)
-def test_loss_of_bodies_needs_a_static_background(folder, tmp_path, settings):
-    data = dataclasses.replace(CONFIG.data, **settings.get("data", {}))
-    with pytest.raises(InputError, match="loss.bodies: requires a static background"):
-        trainer_at(folder, tmp_path, loss=LossConfig(bodies=1.0), data=data, effects=settings.get("effects", {}))
