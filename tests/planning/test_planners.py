@@ -18,11 +18,12 @@ LOW, HIGH = torch.tensor([-4.0], dtype=torch.float64), torch.tensor([4.0], dtype
 
 
 def double_integrator(state, actions):
-    """States [K, H, 2] after each action: position and velocity."""
-    current, states = state.expand(len(actions), 2), []
-    for step in range(actions.shape[1]):
-        current = current @ A.T + actions[:, step] @ B.T
-        states.append(current)
+    """States [K, H, 2] after each action: position and velocity. Without matrix products, whose last bits depend on the
+    number of rows on some processors."""
+    (position, velocity), states = state.expand(len(actions), 2).unbind(1), []
+    for force in actions[..., 0].unbind(1):
+        position, velocity = position + DT * velocity + DT**2 / 2 * force, velocity + DT * force
+        states.append(torch.stack([position, velocity], 1))
     return torch.stack(states, 1)
 
 
