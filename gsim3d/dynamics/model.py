@@ -124,9 +124,9 @@ class Dynamics(nn.Module):
         pyramid = self.geometry(background, curves=curves)
         context, recorders = FrozenContext.begin(pyramid, background, self.config.pyramid_spec(0), curves)
         if recorders:
-            base = self.layout.pack(background)
+            base = self.layout.input_columns(background)
             further = sum(prior.n_conv_features + prior.n_features for prior in self.priors)
-            x = torch.cat([base, base.new_zeros(len(base), further)], 1)  # no features of priors
+            x = torch.cat([*base, base[0].new_zeros(len(base[0]), further)], 1)  # no features of priors
             x = ops.pool_mean(x, pyramid.rows, pyramid.cu_rows, check=False)
             self.net(x, pyramid, generator=self._draws(generator, x.device), contexts=recorders)
         return context
@@ -237,7 +237,7 @@ class Dynamics(nn.Module):
     def _features(self, ctx: StepContext) -> Tensor:
         """Input channels [M, C] of the history: for a graph network positions in cells, then attributes, conv features
         of priors, and their other features."""
-        columns = [self.layout.pack(ctx.history)]
+        columns = self.layout.input_columns(ctx.history)
         if self.config.graph is not None:
             columns.insert(0, (relative_positions(ctx.history) / self.config.grid_size).to(columns[0]))
         for width, features in (("n_conv_features", "conv_features"), ("n_features", "features")):

@@ -102,8 +102,8 @@ class StateLayout:
                 outputs.setdefault(name, []).append(part)
         return {name: torch.stack(steps) for name, steps in outputs.items()}, gains
 
-    def pack(self, particles: Particles) -> Tensor:
-        """Network input [N, in_channels] of all particles."""
+    def input_columns(self, particles: Particles) -> list[Tensor]:
+        """Network input of all particles, as columns [N, n] of ``in_channels`` in all."""
         config, columns = self.config, []
         for name, n in self.inputs:
             value = getattr(particles, name)
@@ -113,7 +113,7 @@ class StateLayout:
             columns.append(_flat(name, value))
         if config.position_features:
             columns.append(position_features(particles, config.grid_size, config.position_length))
-        return torch.cat(columns, 1)
+        return columns
 
     def displacements(self, particles: Particles, outputs: Mapping[str, Tensor]) -> Tensor:
         """Predicted displacements [S, N, 3] in metres from the newest positions, for each step of a call."""

@@ -35,6 +35,7 @@ from gsim3d.nn.multiview_encoder import Encoder, StaticShapes
 from gsim3d.numerics.report import StabilityReport
 from gsim3d.ops import PyramidCapacity
 from gsim3d.ops.curve import Pyramid
+from gsim3d.ops.streams import Turns
 from gsim3d.simulator import Simulator
 from gsim3d.state import ASLEEP, DYNAMIC, Particles, concatenate
 from gsim3d.train.gradients import in_segments, recomputing
@@ -305,24 +306,28 @@ class _Step:
         if owner.whole:
             segments = iter([list(chain.from_iterable(segments))])
         once = [*owner.simulator.encoder.parameters(), *owner.simulator.renderer.parameters()]
-        losses, errors, total = [], [], [None] * (len(once) + len(list(dynamics.parameters())))
-        begin, steps = 0, [state, *next(segments, [])]
-        while steps:
-            particles = concatenate(steps)
-            end = begin + particles.n_clouds // len(self._batch.targets.origin)
-            loss, wrong = self._loss(particles, begin, end, report)
-            gradients = torch.autograd.grad(loss, [*once, *chain.from_iterable(of_calls)], allow_unused=True)
-            n = len(total) - len(once)
-            by_call = [gradients[first : first + n] for first in range(len(once), len(gradients), n)]
-            found = [*gradients[: len(once)], *(_sums(by_call[::-1]) if by_call else [None] * n)]
-            total = _sums([total, found])
-            losses.append(loss.detach())
-            errors.append(wrong)
-            of_calls.clear()
-            report.is_closed = False
-            begin, steps = end, next(segments, [])
+        losses, errors, found, n = [], [], [], len(list(dynamics.parameters()))
+        begin, steps, turns = 0, [state], Turns(self._weights)
+        while True:
+            with turns.take():
+                steps += next(segments, [])
+                if not steps:
+                    break
+                turns.hand_over()  # the next segment is simulated beside the backward pass of this one
+                particles = concatenate(steps)
+                end = begin + particles.n_clouds // len(self._batch.targets.origin)
+                loss, wrong = self._loss(particles, begin, end, report)
+                gradients = torch.autograd.grad(loss, [*once, *chain.from_iterable(of_calls)], allow_unused=True)
+                by_call = [gradients[first : first + n] for first in range(len(once), len(gradients), n)]
+                found.append([*gradients[: len(once)], *(_sums(by_call[::-1]) if by_call else [None] * n)])
+                losses.append(loss.detach())
+                errors.append(wrong)
+                of_calls.clear()
+                report.is_closed = False
+                begin, steps = end, []
+        turns.join()
         report.close()
-        known = dict(zip([*once, *dynamics.parameters()], total, strict=True))
+        known = dict(zip([*once, *dynamics.parameters()], _sums(found), strict=True))
         gradients = tuple(
             None if (gradient := known.get(parameter)) is None else laid_out_as(parameter, gradient)
             for parameter in owner.parameters

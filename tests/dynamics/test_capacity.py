@@ -70,7 +70,7 @@ def test_gradients_are_independent_of_capacity(norm):
 def test_padding_is_finite_and_changes_no_particle():
     dynamics, history = make_dynamics(), make_history((40, 30))
     pyramid, exact = with_room(dynamics, history, 4.0), dynamics.geometry(history)
-    packed = dynamics.layout.pack(history)
+    packed = torch.cat(dynamics.layout.input_columns(history), 1)
     expected = dynamics.net(packed, exact)
     features = dynamics.net(torch.ops.gsim3d.pool_mean(packed, pyramid.rows, pyramid.cu_rows), pyramid)
     assert torch.isfinite(features).all()

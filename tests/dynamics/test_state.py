@@ -20,7 +20,7 @@ def test_channels_of_the_latent_state():
     assert LATENT.inputs == (("dynamic_latents", 4), ("opacities", 1), ("static_latents", 3))
     assert LATENT.outputs == (("dynamic_latents", 4), ("means", 3))
     particles = make_history((5,))
-    packed = LATENT.pack(particles)
+    packed = torch.cat(LATENT.input_columns(particles), 1)
     assert_same_bits(packed[:, 4], particles.opacities)
     assert_same_bits(packed[:, 5:], particles.static_latents)
 
@@ -31,7 +31,7 @@ def test_channels_of_the_explicit_state():
     assert [name for name, _ in layout.outputs] == ["sh", "means", "opacities", "quats", "scales"]
     assert (layout.in_channels, layout.out_channels) == (12 + 1 + 4 + 3 + 3, 12 + 3 + 1 + 3 + 3)
     particles = make_history((5,), config=EXPLICIT)
-    packed = layout.pack(particles)
+    packed = torch.cat(layout.input_columns(particles), 1)
     assert_same_bits(packed[:, :4].contiguous(), particles.sh[:, :, 0].contiguous(), "red harmonics come first")
     assert_same_bits(packed[:, 13:17], particles.quats.roll(-1, 1), "real part last")
 

@@ -144,7 +144,7 @@ def test_rollout(file, case, device):
 
     network_outputs = []
     dynamics.net.register_forward_hook(lambda net, _, features: network_outputs.append(net.head(features)))
-    packed = dynamics.layout.pack(history)
+    packed = torch.cat(dynamics.layout.input_columns(history), 1)
     close(packed, c["step0/net_in_features"][mask], "features that the network reads")
     with torch.no_grad():
         steps = rollout(predict, history, n_steps, n_history)

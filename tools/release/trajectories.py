@@ -78,6 +78,8 @@ class TrajectoryStore:
         self._types = torch.full((capacity, n_points), -1, device=device)
         self._type_of = torch.tensor([self._names.index(name) for name in world.actors], device=device)
         self._near, self._far = rig.near, rig.far
+        # On the stream of training a copy would wait for the step that runs, and the next batch for the copy.
+        self._stream = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None
         self.lock = threading.RLock()  # held while trajectories come or are read
         self.trajectories = [
             Trajectory(
@@ -89,7 +91,7 @@ class TrajectoryStore:
     def put(self, images: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray, actions: np.ndarray | None = None) -> None:
         """Stores a trajectory, as :func:`gsim3d.synth.run.write_trajectory` writes it."""
         rig = Rig(viewmats, Ks, images.shape[2], self._near, self._far)
-        with self.lock:
+        with self.lock, torch.cuda.stream(self._stream):
             slot = self.count % self.capacity
             stored = (self._videos, images), (self._viewmats, viewmats), (self._Ks, Ks)
             for whole, values in (*stored, (self._origins, workspace_origin(rig))):
@@ -99,6 +101,8 @@ class TrajectoryStore:
                 self._actions[slot, :, :n_points].copy_(torch.from_numpy(actions))
                 self._types[slot] = -1
                 self._types[slot, :n_points] = self._type_of[:n_points]
+            if self._stream is not None:
+                self._stream.synchronize()
             self.count += 1
 
     def draw(self, data: DataConfig, phase: PhaseConfig, seed: int, step: int, samples: Sequence[int]) -> Batch:
