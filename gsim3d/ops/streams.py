@@ -84,8 +84,6 @@ class Turns:
 
 
 @functools.cache
-def _streams(
-    device: torch.device, of: torch.cuda.Stream, count: int = MANY_STREAMS
-) -> tuple[torch.cuda.Stream, ...]:
+def _streams(device: torch.device, of: torch.cuda.Stream, count: int = MANY_STREAMS) -> tuple[torch.cuda.Stream, ...]:
     """Streams of the work that ``of`` runs."""
     return tuple(torch.cuda.Stream(device) for _ in range(count))

@@ -290,7 +290,8 @@ class _Step:
         owner, dynamics, of_calls, n_calls = self._owner, self._owner.simulator.dynamics, [], itertools.count(1)
         geometry = _OfCalls(geometry)
 
-        def aliases_of(weights: Sequence[Tensor]) -> list[Tensor]:  # whose gradients few multi-tensor kernels add
+        # Gradients of aliases are added by few multi-tensor kernels, and need no other stream than their use.
+        def aliases_of(weights: Sequence[Tensor]) -> list[Tensor]:
             return [weight.detach().requires_grad_() for weight in weights]
 
         def with_own_weights(predict: Callable[[Particles], Particles]) -> Callable[[Particles], Particles]:
@@ -305,8 +306,9 @@ class _Step:
         segments = self._segments(state, geometry, report, with_own_weights)
         if owner.whole:
             segments = iter([list(chain.from_iterable(segments))])
-        once = [*owner.simulator.encoder.parameters(), *owner.simulator.renderer.parameters()]
-        losses, errors, found, n = [], [], [], len(list(dynamics.parameters()))
+        encoder, head = list(owner.simulator.encoder.parameters()), owner.simulator.renderer
+        once, n = [*encoder, *head.parameters()], len(list(dynamics.parameters()))
+        losses, errors, found = [], [], []
         begin, steps, turns = 0, [state], Turns(self._weights)
         while True:
             with turns.take():
@@ -316,8 +318,10 @@ class _Step:
                 turns.hand_over()  # the next segment is simulated beside the backward pass of this one
                 particles = concatenate(steps)
                 end = begin + particles.n_clouds // len(self._batch.targets.origin)
-                loss, wrong = self._loss(particles, begin, end, report)
-                gradients = torch.autograd.grad(loss, [*once, *chain.from_iterable(of_calls)], allow_unused=True)
+                with _replaced(head.modules(), aliases_of) as of_head:
+                    loss, wrong = self._loss(particles, begin, end, report)
+                used = [*encoder, *of_head, *chain.from_iterable(of_calls)]
+                gradients = torch.autograd.grad(loss, used, allow_unused=True)
                 by_call = [gradients[first : first + n] for first in range(len(once), len(gradients), n)]
                 found.append([*gradients[: len(once)], *(_sums(by_call[::-1]) if by_call else [None] * n)])
                 losses.append(loss.detach())
