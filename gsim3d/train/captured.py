@@ -35,7 +35,6 @@ from gsim3d.nn.multiview_encoder import Encoder, StaticShapes
 from gsim3d.numerics.report import StabilityReport
 from gsim3d.ops import PyramidCapacity
 from gsim3d.ops.curve import Pyramid
-from gsim3d.ops.streams import Turns
 from gsim3d.simulator import Simulator
 from gsim3d.state import ASLEEP, DYNAMIC, Particles, concatenate
 from gsim3d.train.gradients import in_segments, recomputing
@@ -290,8 +289,7 @@ class _Step:
         owner, dynamics, of_calls, n_calls = self._owner, self._owner.simulator.dynamics, [], itertools.count(1)
         geometry = _OfCalls(geometry)
 
-        # Gradients of aliases are added by few multi-tensor kernels, and need no other stream than their use.
-        def aliases_of(weights: Sequence[Tensor]) -> list[Tensor]:
+        def aliases_of(weights: Sequence[Tensor]) -> list[Tensor]:  # whose gradients few multi-tensor kernels add
             return [weight.detach().requires_grad_() for weight in weights]
 
         def with_own_weights(predict: Callable[[Particles], Particles]) -> Callable[[Particles], Particles]:
@@ -306,32 +304,25 @@ class _Step:
         segments = self._segments(state, geometry, report, with_own_weights)
         if owner.whole:
             segments = iter([list(chain.from_iterable(segments))])
-        encoder, head = list(owner.simulator.encoder.parameters()), owner.simulator.renderer
-        once, n = [*encoder, *head.parameters()], len(list(dynamics.parameters()))
-        losses, errors, found = [], [], []
-        begin, steps, turns = 0, [state], Turns(self._weights)
-        while True:
-            with turns.take():
-                steps += next(segments, [])
-                if not steps:
-                    break
-                turns.hand_over()  # the next segment is simulated beside the backward pass of this one
-                particles = concatenate(steps)
-                end = begin + particles.n_clouds // len(self._batch.targets.origin)
-                with _replaced(head.modules(), aliases_of) as of_head:
-                    loss, wrong = self._loss(particles, begin, end, report)
-                used = [*encoder, *of_head, *chain.from_iterable(of_calls)]
-                gradients = torch.autograd.grad(loss, used, allow_unused=True)
-                by_call = [gradients[first : first + n] for first in range(len(once), len(gradients), n)]
-                found.append([*gradients[: len(once)], *(_sums(by_call[::-1]) if by_call else [None] * n)])
-                losses.append(loss.detach())
-                errors.append(wrong)
-                of_calls.clear()
-                report.is_closed = False
-                begin, steps = end, []
-        turns.join()
+        once = [*owner.simulator.encoder.parameters(), *owner.simulator.renderer.parameters()]
+        losses, errors, total = [], [], [None] * (len(once) + len(list(dynamics.parameters())))
+        begin, steps = 0, [state, *next(segments, [])]
+        while steps:
+            particles = concatenate(steps)
+            end = begin + particles.n_clouds // len(self._batch.targets.origin)
+            loss, wrong = self._loss(particles, begin, end, report)
+            gradients = torch.autograd.grad(loss, [*once, *chain.from_iterable(of_calls)], allow_unused=True)
+            n = len(total) - len(once)
+            by_call = [gradients[first : first + n] for first in range(len(once), len(gradients), n)]
+            found = [*gradients[: len(once)], *(_sums(by_call[::-1]) if by_call else [None] * n)]
+            total = _sums([total, found])
+            losses.append(loss.detach())
+            errors.append(wrong)
+            of_calls.clear()
+            report.is_closed = False
+            begin, steps = end, next(segments, [])
         report.close()
-        known = dict(zip([*once, *dynamics.parameters()], _sums(found), strict=True))
+        known = dict(zip([*once, *dynamics.parameters()], total, strict=True))
         gradients = tuple(
             None if (gradient := known.get(parameter)) is None else laid_out_as(parameter, gradient)
             for parameter in owner.parameters

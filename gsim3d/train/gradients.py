@@ -18,14 +18,10 @@ from gsim3d.state import Particles, concatenate
 def in_segments(
     rollout: Callable[[Particles, int], list[Particles]], state: Particles, n_steps: int, cut: int
 ) -> Iterator[list[Particles]]:
-    """Yields ``n_steps`` simulated steps in segments of ``cut`` (0: one), through each of which gradients flow. The
-    first state of each segment lives until all are yielded, as :class:`gsim3d.ops.streams.Turns` needs it."""
-    states = [state]
+    """Yields ``n_steps`` simulated steps in segments of ``cut`` (0: one), through each of which gradients flow."""
     while n_steps:
-        segment = rollout(states[-1], min(cut or n_steps, n_steps))
-        n_steps -= len(segment)
-        if n_steps:
-            states.append(concatenate([states[-1], *segment]).detach())
+        segment = rollout(state, min(cut or n_steps, n_steps))
+        state, n_steps = concatenate([state, *segment]).detach(), n_steps - len(segment)
         yield segment
 
 
