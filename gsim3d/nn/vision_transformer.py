@@ -110,8 +110,7 @@ def rotate(x: Tensor, turn: Tensor) -> Tensor:
 
 
 def rotary(positions: Tensor, dim: int) -> Tensor:
-    """[2, T, dim], cosines and sines of tokens at ``positions`` [T, 2]: half of the channels turn by row, half by
-    column."""
+    """[2, T, dim]: cosines, sines of tokens at ``positions`` [T, 2]: half the channels turn by row, half by column."""
     frequency = ROTARY_BASE ** (-torch.arange(dim // 4, dtype=torch.float64) / (dim // 4))
     angle = (positions[:, :, None] * frequency)[:, :, None].expand(-1, -1, 2, -1).flatten(1)
     return torch.stack([angle.cos(), angle.sin()])

@@ -502,8 +502,7 @@ def _check_whole_numbers(name: str, values: tuple[int, ...]) -> None:
 
 
 def _kernel_map(size: int, voxels: Voxels, taps: tuple[Tensor, Tensor, Tensor], streams: Streams) -> KernelMap:
-    """Larger kernels have one convolution a network call and tables of K^3 entries a row: no plan is kept, except for
-    the gradient of the convolution."""
+    """Plans have K^3 entries a row; that of the stem, one convolution a network call, is kept for its gradient only."""
     plan = None
     if taps[0].is_cuda and (size == 3 or (size == 5 and torch.is_grad_enabled())):
         make = torch.ops.gsim3d.sparse_conv_plan

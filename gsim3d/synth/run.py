@@ -12,6 +12,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from safetensors.numpy import save_file
 
 from gsim3d.effects.spec import FILE as EFFECTS_FILE
 from gsim3d.errors import InputError
@@ -166,10 +167,10 @@ def start_data_worker() -> None:
 
 
 def write_trajectory(world: World, scene: tuple[str, int], file: str) -> str:
-    """Writes trajectory ``scene`` (object, sample) of ``world`` to the .npz ``file``, which is returned: images uint8
-    [T, V, H, W, 4] (RGB and segmentation), viewmats [V, 4, 4] and Ks [V, 3, 3]; with actors also actions [T, A, 3]."""
+    """Writes trajectory ``scene`` (object, sample) of ``world`` to the .safetensors ``file``, which is returned: images
+    uint8 [T, V, H, W, 4] (RGB and segmentation), viewmats [V, 4, 4], Ks [V, 3, 3]; of actors also actions [T, A, 3]."""
     made = world.make(*scene)
     images = np.stack([np.concatenate([view.rgb, view.segmentation[..., None]], -1) for view in made.views])
     actions = {} if made.actions is None else {"actions": made.actions}
-    np.savez(file, images=images, viewmats=made.rig.viewmats, Ks=made.rig.Ks, **actions)
+    save_file({"images": images, "viewmats": made.rig.viewmats, "Ks": made.rig.Ks, **actions}, file)
     return file

@@ -13,6 +13,7 @@ import dataclasses
 import gc
 import itertools
 import math
+import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
@@ -41,6 +42,7 @@ from gsim3d.train.gradients import in_segments, recomputing
 from gsim3d.train.left_out import draw_left_out, images_per_cloud, with_views
 from gsim3d.train.samples import Batch, displaced
 
+os.environ.setdefault("CUDA_DEVICE_MAX_CONNECTIONS", "32")  # queues of a GPU, read when CUDA starts; its default is 8
 # Capacity of geometry and clouds over the largest size so far: smaller causes more captures, larger makes steps slower.
 FACTOR, PARTICLES_FACTOR = 1.1, 1.05
 PARTICLES_UNIT = 256  # cloud capacities are multiples of it
@@ -71,8 +73,7 @@ class Prepared:
         """Key of the graph: batches of equal kind can use the same one."""
         batch, table = self.batch, self.shapes.clouds
         images = len(batch.context.cameras), len(batch.targets.cameras)
-        actions = batch.context.actions
-        points = None if actions is None else (actions.positions.shape, actions.names)
+        points = None if (actions := batch.context.actions) is None else (actions.positions.shape, actions.names)
         return table.scenes, table.steps, batch.n_future, batch.cut, images, points
 
 
@@ -352,8 +353,7 @@ class _Step:
             return targets
         number = torch.arange(len(targets.cameras), device=self._weights.device)
         chosen = number.view(len(targets.origin), n_steps, -1)[:, begin:end].flatten()
-        n_clouds = len(targets.origin) * (end - begin)
-        shows = number[: len(chosen)] // (len(chosen) // n_clouds)
+        shows = number[: len(chosen)] // (len(chosen) // (len(targets.origin) * (end - begin)))
         fields = {name: getattr(targets, name) for name in ("images", "dynamic", "valid")}
         fields = {name: None if value is None else value[chosen] for name, value in fields.items()}
         return dataclasses.replace(targets, cameras=targets.cameras.select(chosen, shows), **fields)

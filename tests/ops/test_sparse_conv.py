@@ -473,6 +473,29 @@ def test_reads_the_geometry_of_build_pyramid():
         assert_close_relative_to_max(out, oracle.sparse_conv(x, weight, bias, cells, "mean"), "sparse_conv_float64")
 
 
+def test_pyramid_keeps_the_plan_of_large_kernels_for_gradients_only(devices):
+    positions = (random_cells(3000, 12, clouds=1)[:, 1:] + 0.5).to(devices[1])
+    spec = PyramidSpec(1.0, 0, (), (), (16,), ((3, 5),))
+    zero, origin = torch.zeros(1, dtype=torch.int64), torch.zeros(1, 3, dtype=torch.float64)
+    clouds = (t.to(devices[1]) for t in (torch.tensor([0, 3000]), zero, zero, origin))
+    arguments = positions, *clouds, spec
+    stage = build_pyramid(*arguments).stages[0]
+    with torch.no_grad():
+        plans = [kernel_map.plan for kernel_map in build_pyramid(*arguments).stages[0].kernel_maps.values()]
+    assert [plan is None for plan in plans] == [False, True]
+    planned = stage.kernel_maps[5]
+    x, weight, bias, cotangent = (t.to(devices[1]) for t in parameters(3000, 24, 32, 5, torch.bfloat16))
+    results = []
+    for kernel_map in (planned, replaced(planned, plan=None)):
+        ours = convolution(stage.voxels, kernel_map)
+        results.append([ours(x, weight, bias), *gradients(ours, [x, weight, bias], cotangent)])
+    for index, (kept, anew) in enumerate(zip(*results, strict=True)):
+        if index == 1:  # taps are summed in mirrored order
+            assert relative_to_max(kept, anew) < 2**-7
+        else:
+            assert_same_bits(kept, anew)
+
+
 def scene_for_bits():
     x, weight, bias, cotangent = parameters(2000, 20, 40, 3, torch.float32)
     ours = {rule: convolution(*geometry(random_cells(2000, 12), 3), rule) for rule in RULES}

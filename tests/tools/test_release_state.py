@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 
 from gsim3d.data import Scene
 from gsim3d.data.recording import BACKGROUND, FIXED, MOVING
@@ -52,7 +53,7 @@ def world():
 @pytest.fixture(scope="module")
 def trajectories(world, tmp_path_factory):
     out = tmp_path_factory.mktemp("trajectories")
-    return [dict(np.load(write_trajectory(world, scene, str(out / f"{scene[1]}.npz")))) for scene in world.scenes()]
+    return [load_file(write_trajectory(world, scene, str(out / f"{scene[1]}.safetensors"))) for scene in world.scenes()]
 
 
 @pytest.fixture
@@ -67,7 +68,7 @@ def store(world, trajectories):
 def test_store_batches_equal_those_of_scene_folders(world, spread, tmp_path):
     world, store = dataclasses.replace(world, camera_spread=spread), TrajectoryStore(world, 2, "cpu")
     for scene in world.scenes():
-        store.put(**np.load(write_trajectory(world, scene, str(tmp_path / "video.npz"))))
+        store.put(**load_file(write_trajectory(world, scene, str(tmp_path / "video.safetensors"))))
     options = {**OPTIONS, "camera_spread": spread}
     folders = generate(tmp_path / "data", preset="mini", processes=1, progress=False, **options).folders
     scenes = [Scene.open(folder) for folder in folders]
@@ -91,7 +92,7 @@ def test_push_recipe_trains_on_a_store_with_actions(tmp_path):
     made = dataclasses.replace(recipe("push"), options=options)
     world, store = made.stream(), TrajectoryStore(made.stream(), 2, "cpu")
     for number, scene in enumerate(world.scenes()):
-        store.put(**np.load(write_trajectory(world, scene, str(tmp_path / f"{number}.npz"))))
+        store.put(**load_file(write_trajectory(world, scene, str(tmp_path / f"{number}.safetensors"))))
     options |= {"preset": made.preset, "seed": world.seed}
     folders = generate(tmp_path / "data", "push", processes=1, progress=False, **options).folders
     acting = {"model": {"dynamics": {"actions": ["pusher"]}}, "effects": made.train.effects}
@@ -120,8 +121,8 @@ def test_store_replaces_oldest_trajectories(store, trajectories):
     darker = trajectories[0]["images"] // 2
     store.put(**{**trajectories[0], "images": darker})
     assert store.count == 3
-    assert torch.equal(store._videos[0], torch.from_numpy(darker))
-    assert torch.equal(store._videos[1], torch.from_numpy(trajectories[1]["images"]))
+    assert torch.equal(store._videos[0], darker)
+    assert torch.equal(store._videos[1], trajectories[1]["images"])
 
 
 def test_data_workers_make_each_trajectory_once(world, trajectories, tmp_path):
@@ -129,7 +130,7 @@ def test_data_workers_make_each_trajectory_once(world, trajectories, tmp_path):
     with DataWorkers(world, store, 1, 1, tmp_path) as workers:
         assert workers.wait_for(2, seconds=60)
         assert workers.wait_for(4, seconds=60) and 4 <= workers.next <= 8
-    assert torch.equal(store._videos[0], torch.from_numpy(trajectories[1]["images"]))  # it began with number 1
+    assert torch.equal(store._videos[0], trajectories[1]["images"])  # it began with number 1
     assert not torch.equal(store._videos[0], store._videos[1])
     assert not list(tmp_path.iterdir()) and threading.active_count() < 50
 
@@ -156,7 +157,8 @@ class Painted:
         video[..., self.size // 2 :, :, 3] = FIXED
         for step in range(self.n_frames):
             video[step, :, 4 + step : 14 + step, 10:20, 3] = MOVING
-        return {"images": video, "viewmats": self.rig().viewmats, "Ks": self.rig().Ks}
+        made = {"images": video, "viewmats": self.rig().viewmats, "Ks": self.rig().Ks}  # as from a data worker
+        return {name: torch.from_numpy(values) for name, values in made.items()}
 
 
 def test_batches_drawn_ahead_belong_to_their_steps(tmp_path, device):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from safetensors.torch import load_file
 
 from gsim3d import pretrained
 from gsim3d.errors import InputError
@@ -45,12 +46,10 @@ def tool(name):
 @pytest.fixture(scope="module")
 def scored(tmp_path_factory, one_thread):
     """A state after two steps, and its scores."""
-    import numpy as np
-
     out = tmp_path_factory.mktemp("shipping")
     world = build_world("elastic", "diverse", OPTIONS)
     store = TrajectoryStore(world, 1, "cpu")
-    store.put(**np.load(write_trajectory(world, ("ball", 0), str(out / "video.npz"))))
+    store.put(**load_file(write_trajectory(world, ("ball", 0), str(out / "video.safetensors"))))
     trainer = RunTrainer(CONFIG, store, out / "run", "cpu")
     trainer.begin_run(time.monotonic() + 60)
     for _ in range(2):

@@ -5,6 +5,7 @@ import gc
 import itertools
 import json
 import math
+import os
 import threading
 from contextlib import nullcontext
 from functools import partial
@@ -247,6 +248,10 @@ def assert_gradients_of_the_loss(captured, drawn, trainer, device, report):
             if gradient is not None:
                 assert (gradient - wanted).abs().max() <= TOLERANCE[device.type] * largest, name
                 assert gradient.stride() == trainer.parameters[name].stride(), name
+
+
+def test_branches_of_a_graph_have_queues_of_their_own():
+    assert "CUDA_DEVICE_MAX_CONNECTIONS" in os.environ  # before CUDA starts
 
 
 class FullGPU:

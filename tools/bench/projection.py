@@ -5,6 +5,7 @@ import torch
 from harness import Bench
 
 from gsim3d.cameras import Cameras
+from gsim3d.math.rotations import rotation_matrices
 from gsim3d.ops import project_gaussians, rasterize_gaussians, rasterize_projected, sh_to_color
 
 N, IMAGES, SIZE = 65536, 2, 256
@@ -28,15 +29,7 @@ def plain_projection(means, quats, scales, cameras):
     """means2d [I, N, 2], conics [I, N, 3] and depths [I, N] of pinholes."""
     points = means @ cameras.viewmats[:, :3, :3].mT + cameras.viewmats[:, None, :3, 3]
     z = points[..., 2]
-    w, i, j, k = torch.nn.functional.normalize(quats, dim=1).unbind(1)
-    R = torch.stack(
-        [
-            1 - 2 * (j * j + k * k), 2 * (i * j - w * k), 2 * (i * k + w * j),
-            2 * (i * j + w * k), 1 - 2 * (i * i + k * k), 2 * (j * k - w * i),
-            2 * (i * k - w * j), 2 * (j * k + w * i), 1 - 2 * (i * i + j * j),
-        ],
-        1,
-    ).view(-1, 3, 3)  # fmt: skip
+    R = rotation_matrices(torch.nn.functional.normalize(quats, dim=1))
     ratio = points[..., :2] / z[..., None]
     W = cameras.viewmats[:, None, :3, :3]
     H = (FOCAL / z)[..., None, None] * (W[:, :, :2] - ratio[..., None] * W[:, :, 2:]) @ (R * scales[:, None])

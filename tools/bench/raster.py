@@ -8,6 +8,7 @@ import torch
 from harness import Bench, with_gradients
 from raster_scenes import layered_scene, packed, pixel_aligned_scene, repeated, sh_of
 
+from gsim3d.math.rotations import rotation_matrices
 from gsim3d.math.spherical_harmonics import sh_basis
 from gsim3d.ops import rasterize_gaussians
 
@@ -19,15 +20,7 @@ def project(means, quats, scales, opacities, sh, W, t):
     """Pixel mean [N, 2], inverse covariance (a, b, c) [N, 3], depth [N], colour [N, 3], reach in pixels [N, 2]."""
     p = means @ W.T + t
     z = p[:, 2]
-    w, i, j, k = torch.nn.functional.normalize(quats, dim=1).unbind(1)
-    R = torch.stack(
-        [
-            1 - 2 * (j * j + k * k), 2 * (i * j - w * k), 2 * (i * k + w * j),
-            2 * (i * j + w * k), 1 - 2 * (i * i + k * k), 2 * (j * k - w * i),
-            2 * (i * k - w * j), 2 * (j * k + w * i), 1 - 2 * (i * i + j * j),
-        ],
-        1,
-    ).view(-1, 3, 3)  # fmt: skip
+    R = rotation_matrices(torch.nn.functional.normalize(quats, dim=1))
     ratio = (p[:, :2] / z[:, None]).clamp(-0.65 * SIZE / FOCAL, 0.65 * SIZE / FOCAL)
     H = (FOCAL / z)[:, None, None] * (W[None, :2] - ratio[:, :, None] * W[2]) @ (R * scales[:, None])
     xx, xy, yy = (H[:, 0] ** 2).sum(1) + 0.3, (H[:, 0] * H[:, 1]).sum(1), (H[:, 1] ** 2).sum(1) + 0.3

@@ -20,7 +20,7 @@ from tools.release.recipes import of_processes
 from tools.release.state import CURVE, Progress, save_state, save_weights
 from tools.release.trajectories import DataWorkers, TrajectoryStore
 
-WARM_UP = 200  # steps after each start: first moments begin at zero
+WARM_UP = 50  # steps after each start: first moments begin at zero
 COOL_DOWN = 0.5  # share of a last run in which the learning rate falls to LAST_RATE of its peak
 LAST_RATE = 0.01
 SAVE_EVERY = 120.0  # seconds
@@ -43,7 +43,7 @@ class RunTrainer(Trainer):
         self.first_step, self.begin, self.now, self.end, self.is_last = 0, 0.0, 0.0, math.inf, False
         self.gone: str | None = None
         self.new_parameters: list[str] = []
-        self._side = torch.cuda.Stream() if device == "cuda" else None
+        self.data_seconds = 0.0  # for which the last step waited for its batch
         self._next: tuple[int, Future] | None = None
         self._reader = ThreadPoolExecutor(1)
 
@@ -83,8 +83,10 @@ class RunTrainer(Trainer):
     def _prepared(self, samples: list[int]) -> Prepared:
         """Drawn while the GPU computed the step before."""
         ahead = self._next if self._next is not None and self._next[0] == self.step else self._begin_to_draw(self.step)
+        start = time.perf_counter()
         # The last one was copied by a step that is over: only now may its memory be used anew.
         self._read = ahead[1].result()
+        self.data_seconds = time.perf_counter() - start
         return self._read
 
     def _draw_next(self) -> None:
@@ -95,14 +97,14 @@ class RunTrainer(Trainer):
 
     @torch.no_grad()
     def _draw_ahead(self, step: int) -> Prepared:
-        """Draws a batch on a stream of its own."""
+        """Draws a batch in the store's stream."""
         phase, _ = self.config.phase_of(step)
-        if self._side is not None:
-            torch.cuda.set_device(self._side.device)  # of this thread
-        with self.store.lock, torch.cuda.stream(self._side):
+        if self.store.stream is not None:
+            torch.cuda.set_device(self.store.device)  # of this thread
+        with self.store.lock, torch.cuda.stream(self.store.stream):
             prepared = self.captured.prepare(self._draw(step, self.processes.share(phase.batch)))
-            if self._side is not None:
-                self._side.synchronize()
+            if self.store.stream is not None:
+                self.store.stream.synchronize()
         return prepared
 
 
@@ -166,7 +168,8 @@ def train(
             trainer.seconds += spent
             was, windows = windows, windows + phase.batch * (phase.horizon > 0)
             if entry["step"] % settings.log_every == 0 or "skipped" in entry:
-                machine = {"seconds": trainer.seconds, "step_seconds": spent, "memory_gib": memory_gib(trainer.device)}
+                machine = {"seconds": trainer.seconds, "step_seconds": spent, "data_seconds": trainer.data_seconds}
+                machine["memory_gib"] = memory_gib(trainer.device)
                 entry |= {
                     "windows": windows,
                     "trajectories": sum(gather(workers.count)),
@@ -199,7 +202,8 @@ def line(entry: dict, machine: dict) -> str:
     decibels = " ".join(f"{name} {value:.2f}" for name, value in known.items() if isinstance(value, float))
     return (
         f"step {entry['step']:6d}  windows {entry['windows']:7d}  loss {entry['loss']:.5f}  {decibels} dB  "
-        f"norm {entry['grad_norm']:.3f}  rate {entry['learning_rate']:.1e}  {machine['step_seconds']:.3f} s  "
+        f"norm {entry['grad_norm']:.3f}  rate {entry['learning_rate']:.1e}  {machine['step_seconds']:.3f} s, "
+        f"{machine['data_seconds']:.3f} of it for data  "
         f"{machine['memory_gib']:.1f} GiB  {entry['particles']:.0f} particles  {entry['trajectories']} trajectories  "
         f"{entry['captures']} captures"
     )

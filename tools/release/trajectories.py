@@ -14,8 +14,9 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import torch
+from safetensors.torch import load_file
+from torch import Tensor
 
 from gsim3d.cameras import Cameras, Frames
 from gsim3d.data import Window, generator
@@ -78,9 +79,9 @@ class TrajectoryStore:
         self._types = torch.full((capacity, n_points), -1, device=device)
         self._type_of = torch.tensor([self._names.index(name) for name in world.actors], device=device)
         self._near, self._far = rig.near, rig.far
-        # On the stream of training a copy would wait for the step that runs, and the next batch for the copy.
-        self._stream = torch.cuda.Stream(self.device) if self.device.type == "cuda" else None
-        self.lock = threading.RLock()  # held while trajectories come or are read
+        self.lock = threading.RLock()  # held while trajectories come or are read, in this stream:
+        # in that of training a copy would wait for the running step; of its priority, it might share a queue with it
+        self.stream = torch.cuda.Stream(self.device, priority=-1) if self.device.type == "cuda" else None
         self.trajectories = [
             Trajectory(
                 slot, Path(f"trajectory_{slot}"), *self._shape[:2], rig.size, rig.size, world.fps, bool(self._names)
@@ -88,21 +89,21 @@ class TrajectoryStore:
             for slot in range(capacity)
         ]
 
-    def put(self, images: np.ndarray, viewmats: np.ndarray, Ks: np.ndarray, actions: np.ndarray | None = None) -> None:
+    def put(self, images: Tensor, viewmats: Tensor, Ks: Tensor, actions: Tensor | None = None) -> None:
         """Stores a trajectory, as :func:`gsim3d.synth.run.write_trajectory` writes it."""
-        rig = Rig(viewmats, Ks, images.shape[2], self._near, self._far)
-        with self.lock, torch.cuda.stream(self._stream):
+        rig = Rig(viewmats.numpy(), Ks.numpy(), images.shape[2], self._near, self._far)
+        with self.lock, torch.cuda.stream(self.stream):
             slot = self.count % self.capacity
             stored = (self._videos, images), (self._viewmats, viewmats), (self._Ks, Ks)
-            for whole, values in (*stored, (self._origins, workspace_origin(rig))):
-                whole[slot].copy_(torch.from_numpy(values))
+            for whole, values in (*stored, (self._origins, torch.from_numpy(workspace_origin(rig)))):
+                whole[slot].copy_(values)
             if actions is not None:
                 n_points = actions.shape[1]
-                self._actions[slot, :, :n_points].copy_(torch.from_numpy(actions))
+                self._actions[slot, :, :n_points].copy_(actions)
                 self._types[slot] = -1
                 self._types[slot, :n_points] = self._type_of[:n_points]
-            if self._stream is not None:
-                self._stream.synchronize()
+            if self.stream is not None:
+                self.stream.synchronize()
             self.count += 1
 
     def draw(self, data: DataConfig, phase: PhaseConfig, seed: int, step: int, samples: Sequence[int]) -> Batch:
@@ -244,7 +245,7 @@ class DataWorkers:
             number, names = self.next + turn_of(self._together, self.next), self._names
             self.next, self._begun = self.next + self._together.count, self._begun + 1
             scene = names[number % len(names)], number // len(names)
-            job = self._pool.submit(write_trajectory, self._world, scene, str(self._cache / f"{number}.npz"))
+            job = self._pool.submit(write_trajectory, self._world, scene, str(self._cache / f"{number}.safetensors"))
             job.add_done_callback(self._take)
 
     def _take(self, job: Future) -> None:
@@ -253,8 +254,7 @@ class DataWorkers:
             return
         try:
             file = Path(job.result())
-            with np.load(file) as trajectory:
-                self._store.put(**trajectory)
+            self._store.put(**load_file(file))
             file.unlink()
             self._begun -= 1
             self._begin()
