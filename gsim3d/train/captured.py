@@ -284,7 +284,7 @@ class _Step:
             with owner.precision("dynamics"):
                 return owner.simulator.rollout(state, n_steps, plan=plan, **given)
 
-        return in_segments(rollout, state, self._batch.n_future, self._batch.cut)
+        return in_segments(rollout, state, self._batch.n_future, self._batch.cut, plan.history)
 
     def _compute(self, geometry: Callable[[Particles], Pyramid], report: StabilityReport) -> tuple:
         owner, dynamics, of_calls, n_calls = self._owner, self._owner.simulator.dynamics, [], itertools.count(1)

@@ -405,8 +405,8 @@ class Trainer:
                 begin = simulator._prepare(particles, self.plan)
                 begin = displaced(begin, batch.noise, simulator.config.dynamics.grid_size)
                 given = {"plan": self.plan, "generator": noise, "wrap": again("steps", noise), **options}
-                segments = in_segments(partial(simulator.rollout, **given), begin, batch.n_future, batch.cut)
-                steps = [step for segment in segments for step in segment]
+                sizes = batch.n_future, batch.cut, self.plan.history
+                steps = sum(in_segments(partial(simulator.rollout, **given), begin, *sizes), [])
             if self._is_logged:
                 watch.follow(steps)
             particles = concatenate([particles, *steps])
