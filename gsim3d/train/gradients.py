@@ -18,7 +18,7 @@ from gsim3d.state import Particles, concatenate
 def in_segments(
     rollout: Callable[[Particles, int], list[Particles]], state: Particles, n_steps: int, cut: int, history: int
 ) -> Iterator[list[Particles]]:
-    """Yields ``n_steps`` steps in segments of ``cut`` (0: one); gradients end between them. ``history``: of the model."""
+    """Yields ``n_steps`` steps in segments of ``cut`` (0: one), through each of which gradients flow."""
     while n_steps:
         segment = rollout(state, min(cut or n_steps, n_steps))
         state, n_steps = concatenate([state, *segment[-history:]], history).detach(), n_steps - len(segment)
