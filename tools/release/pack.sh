@@ -26,6 +26,7 @@ echo "$packed/source.tar.gz: $((size / 1024)) KiB of $commit"
 work="$(mktemp -d)" && trap 'rm -rf "$work"' EXIT
 tar -xzf "$packed/source.tar.gz" -C "$work" && mkdir -p "$packed/build" && cd "$work"
 [ ! -x /usr/bin/g++ ] || export CXX="${CXX:-/usr/bin/g++}" CC="${CC:-/usr/bin/gcc}"
+[ ! -d /usr/local/cuda ] || export CUDA_HOME="${CUDA_HOME:-/usr/local/cuda}"
 export GSIM3D_CUDA=1 TORCH_CUDA_ARCH_LIST="${TORCH_CUDA_ARCH_LIST:-9.0a}"
 sources="$(find csrc setup.py -type f -print0 | LC_ALL=C sort -z | xargs -0 cat | sha256sum | cut -d ' ' -f 1)"  # as start.sh
 "$4" setup.py -q build_ext --inplace
