@@ -28,7 +28,8 @@ tar -xzf "$packed/source.tar.gz" -C "$work" && mkdir -p "$packed/build" && cd "$
 [ ! -x /usr/bin/g++ ] || export CXX="${CXX:-/usr/bin/g++}" CC="${CC:-/usr/bin/gcc}"
 [ ! -d /usr/local/cuda ] || export CUDA_HOME="${CUDA_HOME:-/usr/local/cuda}"
 export GSIM3D_CUDA=1 TORCH_CUDA_ARCH_LIST="${TORCH_CUDA_ARCH_LIST:-9.0a}"
-sources="$(find csrc setup.py -type f -print0 | LC_ALL=C sort -z | xargs -0 cat | sha256sum | cut -d ' ' -f 1)"  # as start.sh
+# As start.sh does.
+sources="$(find csrc setup.py -type f -print0 | LC_ALL=C sort -z | xargs -0 cat | sha256sum | cut -d ' ' -f 1)"
 "$4" setup.py -q build_ext --inplace
 strip --strip-debug gsim3d/*.so
 for file in gsim3d/*.so; do xz -T0 -c "$file" >"$packed/build/$(basename "$file").xz"; done
