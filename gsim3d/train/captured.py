@@ -13,7 +13,6 @@ import dataclasses
 import gc
 import itertools
 import math
-import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
@@ -42,7 +41,6 @@ from gsim3d.train.gradients import in_segments, recomputing
 from gsim3d.train.left_out import draw_left_out, images_per_cloud, with_views
 from gsim3d.train.samples import Batch, displaced
 
-os.environ.setdefault("CUDA_DEVICE_MAX_CONNECTIONS", "32")  # queues of a GPU, read when CUDA starts; its default is 8
 # Capacity of geometry and clouds over the largest size so far: smaller causes more captures, larger makes steps slower.
 FACTOR, PARTICLES_FACTOR = 1.1, 1.05
 PARTICLES_UNIT = 256  # cloud capacities are multiples of it

@@ -79,9 +79,11 @@ class TrajectoryStore:
         self._types = torch.full((capacity, n_points), -1, device=device)
         self._type_of = torch.tensor([self._names.index(name) for name in world.actors], device=device)
         self._near, self._far = rig.near, rig.far
-        self.lock = threading.RLock()  # held while trajectories come or are read, in this stream:
-        # in that of training a copy would wait for the running step; of its priority, it might share a queue with it
-        self.stream = torch.cuda.Stream(self.device, priority=-1) if self.device.type == "cuda" else None
+        self.lock = threading.RLock()  # held while trajectories come or are read
+        self.stream: torch.cuda.Stream | None = None  # in which they do, on a GPU
+        if self.device.type == "cuda":  # in the stream of training they would wait for the step that runs
+            self.stream = torch.cuda.Stream(self.device, priority=-1)  # does not share its queue
+            self.stream.wait_stream(torch.cuda.current_stream(self.device))  # which clears the memory above
         self.trajectories = [
             Trajectory(
                 slot, Path(f"trajectory_{slot}"), *self._shape[:2], rig.size, rig.size, world.fps, bool(self._names)
