@@ -126,23 +126,19 @@ def _align(
     now, window = windows.movable.samples, windows.weights
     outwards = F.normalize(now.positions - windows.to_samples(center)[0], dim=2)
     positions = now.positions + config.inside * outwards
-    targets = []
-    for view in range(seen.n_views):
-        colours, is_visible = seen.colours(view, positions)
-        targets.append((colours, now.known & is_visible & seen.faces(view, positions, outwards)))
+    targets, is_visible = seen.colours(positions)
+    is_visible = is_visible & now.known[:, None] & seen.faces(positions, outwards)
     for _ in range(PASSES):
         shift, rotation, pivot = windows.to_samples(velocity, spin, center)
         earlier = positions + next_displacement(positions, -shift, -rotation, pivot)
-        hessian, gradient = earlier.new_zeros(*earlier.shape[:2], 6, 6), earlier.new_zeros(*earlier.shape[:2], 6)
-        for view, (colours, is_visible) in enumerate(targets):
-            matched, was_visible, jacobian = before.slopes(view, earlier)
-            residual, confidence = colours - matched, is_visible & was_visible & before.faces(view, earlier, outwards)
-            confidence = confidence * (config.robust / residual.norm(dim=2).clamp(min=config.robust))
-            by_spin = torch.linalg.cross(jacobian, (earlier + shift - pivot)[:, :, None].expand_as(jacobian))
-            by_motion = torch.cat([by_spin, -jacobian], 3)
-            hessian = hessian + confidence[..., None, None] * (by_motion.mT @ by_motion)
-            gradient = gradient + confidence[..., None] * (by_motion * residual[..., None]).sum(2)
-        change = _solve6((window @ hessian.flatten(2)).unflatten(2, (6, 6)), window @ gradient)
+        matched, was_visible, jacobian = before.slopes(earlier)
+        residual, confidence = targets - matched, is_visible & was_visible & before.faces(earlier, outwards)
+        confidence = confidence * (config.robust / residual.norm(dim=3).clamp(min=config.robust))
+        by_spin = torch.linalg.cross(jacobian, (earlier + shift - pivot)[:, None, :, None].expand_as(jacobian))
+        by_motion = torch.cat([by_spin, -jacobian], 4)
+        sums = by_motion.mT @ (confidence[..., None, None] * torch.cat([by_motion, residual[..., None]], 4))
+        sums = (window @ sums.sum(1).flatten(2)).unflatten(2, (6, 7))
+        change = _solve6(sums[..., :6], sums[..., 6])
         spin, velocity = spin + change[..., :3], velocity + change[..., 3:]
     return velocity, spin
 
@@ -192,7 +188,6 @@ class _Views:
         clouds = constant(tuple(chosen), device)
         scenes = constant(tuple(particles.clouds.scenes[q] for q in chosen), device)
         chosen_images = images[clouds]
-        self.n_views = images.shape[1]
         pixels = frames.images[chosen_images].to(center.dtype)
         moves = is_image[clouds][:, :, None, None, None].to(center.dtype).expand_as(pixels[:, :, :1])
         if frames.dynamic is not None:
@@ -207,36 +202,36 @@ class _Views:
         self._rotation, self._way = rotation.to(center.dtype), way.to(center.dtype)
         self._Ks = cameras.Ks[chosen_images].to(center.dtype)
 
-    def faces(self, view: int, positions: Tensor, outwards: Tensor) -> Tensor:
-        """bool [B, S]: whether a surface at ``positions`` with normals ``outwards`` faces the camera."""
-        towards = F.normalize(self._eyes[:, view, None] - positions, dim=2)
-        return (towards * outwards).sum(2) > self._facing
+    def faces(self, positions: Tensor, outwards: Tensor) -> Tensor:
+        """bool [B, V, S]: whether a surface at ``positions`` [B, S, 3] with normals ``outwards`` faces the cameras."""
+        towards = F.normalize(self._eyes[:, :, None] - positions[:, None], dim=3)
+        return (towards * outwards[:, None]).sum(3) > self._facing
 
-    def colours(self, view: int, positions: Tensor) -> tuple[Tensor, Tensor]:
-        """Colours [B, S, 3] at ``positions``, and the mask bool [B, S] of valid ones."""
-        values, _ = self._at(view, positions)
+    def colours(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """Colours [B, V, S, 3] at ``positions``, and the mask bool [B, V, S] of valid ones."""
+        values, _ = self._at(positions)
         return values[..., :3], values[..., 9] > SHOWN
 
-    def slopes(self, view: int, positions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """As :meth:`colours`, and the Jacobian of the colours by the positions [B, S, 3, 3]."""
-        values, at = self._at(view, positions)
-        K, depth = self._Ks[:, view], at[..., 2:]
+    def slopes(self, positions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """As :meth:`colours`, and the Jacobian of the colours by the positions [B, V, S, 3, 3]."""
+        values, at = self._at(positions)
+        focal, depth = self._Ks[:, :, None, :2], at[..., 2:]
         nothing = torch.zeros_like(depth)
-        across = torch.cat([depth, nothing, -at[..., :1]], 2) * (K[:, :1, :1] / depth.square())
-        down = torch.cat([nothing, depth, -at[..., 1:2]], 2) * (K[:, 1:2, 1:2] / depth.square())
-        by_pixel = torch.stack([values[..., 3:6], values[..., 6:9]], 3)
-        by_place = torch.stack([across, down], 2) @ self._rotation[:, view, None]
+        across = torch.cat([depth, nothing, -at[..., :1]], 3) * (focal[..., 0, :1] / depth.square())
+        down = torch.cat([nothing, depth, -at[..., 1:2]], 3) * (focal[..., 1, 1:2] / depth.square())
+        by_pixel = torch.stack([values[..., 3:6], values[..., 6:9]], 4)
+        by_place = torch.stack([across, down], 3) @ self._rotation[:, :, None]
         return values[..., :3], values[..., 9] > SHOWN, by_pixel @ by_place
 
-    def _at(self, view: int, positions: Tensor) -> tuple[Tensor, Tensor]:
+    def _at(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Bilinear samples of the images at ``positions``, and the positions in camera coordinates."""
-        at = positions @ self._rotation[:, view].mT + self._way[:, view, None]
-        at = torch.cat([at[..., :2], at[..., 2:].clamp(min=NEAR)], 2)
-        pixel = (at @ self._Ks[:, view].mT)[..., :2] / at[..., 2:]
-        values = self._values[:, view]
-        place = torch.stack([2 * pixel[..., k] / values.shape[3 - k] - 1 for k in (0, 1)], 2)
-        found = F.grid_sample(values, place[:, :, None], padding_mode="border", align_corners=False)
-        return found[..., 0].mT, at
+        at = positions[:, None] @ self._rotation.mT + self._way[:, :, None]
+        at = torch.cat([at[..., :2], at[..., 2:].clamp(min=NEAR)], 3)
+        pixel = (at @ self._Ks.mT)[..., :2] / at[..., 2:]
+        place = torch.stack([2 * pixel[..., k] / self._values.shape[4 - k] - 1 for k in (0, 1)], 3)
+        images, places = self._values.flatten(0, 1), place.flatten(0, 1)[:, :, None]
+        found = F.grid_sample(images, places, padding_mode="border", align_corners=False)
+        return found[..., 0].mT.unflatten(0, place.shape[:2]), at
 
 
 def _smoothed(images: Tensor, blur: float) -> Tensor:
