@@ -18,6 +18,7 @@ from gsim3d.dynamics.frozen_context import FrozenContext
 from gsim3d.dynamics.partition import Partition
 from gsim3d.dynamics.step import StateLayout
 from gsim3d.nn.graph_network import GraphNetwork
+from gsim3d.nn.layers import product_dtype
 from gsim3d.nn.point_transformer import PointTransformer
 from gsim3d.ops.curve import Pyramid, PyramidCapacity
 from gsim3d.priors import Motion, StepContext
@@ -220,11 +221,14 @@ class Dynamics(nn.Module):
         if pyramid.found is not None and self.training and self.config.norm == "batch" and None in n_data:
             said = 'norm="batch" cannot be trained with a pyramid of given capacity; use norm="layer"'
             raise ValueError(f"Dynamics: {said}")
-        x = self._features(ctx)
+        columns = self._columns(ctx)
         n_seen = pyramid.rows.shape[0] if pyramid.found is None else n_data[0]
         all_seen = n_seen == history.n_rows
         if not all_seen:  # rows of the pyramid <-> rows of the history; unseen rows become 0
-            x = ops.pool_mean(x, pyramid.rows, pyramid.cu_rows, check=False)
+            columns = [ops.pool_mean(column, pyramid.rows, pyramid.cu_rows, check=False) for column in columns]
+        if self.config.graph is None:
+            columns = [column.to(product_dtype(column)) for column in columns]
+        x = columns[0] if len(columns) == 1 else torch.cat(columns, 1)
         contexts = () if background is None else background.readers(pyramid, history)
         x = self.net(x, pyramid, generator=self._draws(generator, x.device), contexts=contexts)
         if not all_seen:
@@ -234,9 +238,9 @@ class Dynamics(nn.Module):
         prediction = self.net.head(ctx.select_newest(x), self.layout.columns(ctx.changes))
         return self.layout.split(prediction, ctx.changes)
 
-    def _features(self, ctx: StepContext) -> Tensor:
-        """Input channels [M, C] of the history: for a graph network positions in cells, then attributes, conv features
-        of priors, and their other features."""
+    def _columns(self, ctx: StepContext) -> list[Tensor]:
+        """Input channels of the history, as columns [M, n]: for a graph network positions in cells, then attributes,
+        conv features of priors, and their other features."""
         columns = self.layout.input_columns(ctx.history)
         if self.config.graph is not None:
             columns.insert(0, (relative_positions(ctx.history) / self.config.grid_size).to(columns[0]))
@@ -245,7 +249,7 @@ class Dynamics(nn.Module):
                 if n := getattr(prior, width):
                     made = None if ctx.is_empty else getattr(prior, features)(ctx)
                     columns.append(columns[0].new_zeros(len(columns[0]), n) if made is None else made)
-        return columns[0] if len(columns) == 1 else torch.cat(columns, 1)
+        return columns
 
     def context(
         self,
