@@ -1,7 +1,9 @@
-"""AdamW for many small tensors, learning-rate schedule, weight averaging, loss scaling and deterministic mode."""
+"""Muon and AdamW for many small tensors, learning-rate schedule, weight averaging, loss scaling, deterministic mode."""
 
+import itertools
 import math
 import os
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
@@ -16,77 +18,124 @@ START_DIVISOR = 25  # initial learning rate = peak / START_DIVISOR
 END_DIVISOR = 1e4  # final learning rate = initial / END_DIVISOR
 FIRST_SCALE, LARGEST_SCALE = 2.0**16, 2.0**24
 STEPS_TO_DOUBLE = 2000  # consecutive finite steps after which the loss scale doubles
+SMALLEST_SIDE = 16  # of the matrices that Muon updates
+MOMENTUM = 0.95  # of Muon
+UPDATE_SIZE = 0.2  # root mean square of an update of Muon at rate 1, about that of AdamW (Liu et al. 2025)
+NEWTON_SCHULZ = (3.4445, -4.775, 2.0315)  # coefficients of x, x^3 and x^5
+ITERATIONS = 5
 
 
-class Optimizer(torch.optim.AdamW):
-    """AdamW with explicit gradients and clipping at a global norm.
+class Optimizer:
+    """Muon for weight matrices and AdamW for other parameters, with explicit gradients and clipping at a global norm.
 
-    On a GPU an update takes about thirty multi-tensor kernels; torch's own step would loop over tensors in Python and
-    count steps on the host.
+    Matrices are those inside of the networks (:func:`is_matrix`); a convolution's weight is one of output channels x
+    the rest. Muon sets the singular values of their momentum to about 1 and scales it by ``0.2 sqrt(longer side)``, so
+    that the learning rate and weight decay of AdamW fit.
 
     Args:
         parameters: parameters by name; those of ``encoder.`` may have another learning rate.
         settings: hyperparameters.
+
+    Attributes:
+        state: "exp_avg" of a parameter and, of AdamW, "step" and "exp_avg_sq"; empty before its first update.
+
+    Source:
+        Jordan et al. 2024, "Muon: an optimizer for hidden layers in neural networks"; Liu et al. 2025, "Muon is
+        scalable for LLM training"; Loshchilov and Hutter 2019, "Decoupled weight decay regularization".
     """
 
     def __init__(self, parameters: Mapping[str, nn.Parameter], settings: OptimizerConfig):
-        parts = {part: [p for name, p in parameters.items() if name.startswith("encoder.") == part] for part in (0, 1)}
-        super().__init__(
-            [{"params": members, "encodes": part} for part, members in parts.items()],
-            lr=0.0,
-            betas=(settings.beta1, settings.beta2),
-            eps=settings.eps,
-            weight_decay=settings.weight_decay,
-        )
-        self._parameters = list(parameters.values())
-        self._limit = settings.clip_norm or math.inf
+        self._parameters, self._settings = list(parameters.values()), settings
+        self._encodes = {p for name, p in parameters.items() if name.startswith("encoder.")}
+        self._matrices = {p for name, p in parameters.items() if settings.muon and is_matrix(name, p)}
+        self.state: dict[nn.Parameter, dict[str, Tensor]] = defaultdict(dict)
 
     @torch.no_grad()
     def update(self, gradients: Sequence[Tensor | None], norm: Tensor, rate: float, encoder_rate: float = 1.0) -> None:
         """Performs one update at learning ``rate``, times ``encoder_rate`` for the encoder, with ``gradients`` in the
         order of the parameters (clipped in place; None: unchanged), whose global ``norm`` is a scalar tensor."""
-        for group in self.param_groups:
-            group["lr"] = rate * encoder_rate if group["encodes"] else rate
-        if norm.is_cuda:
-            self._update_on_gpu(gradients, norm)
-            return
-        for parameter, gradient in zip(self._parameters, gradients, strict=True):
-            parameter.grad = gradient
-        torch.nn.utils.clip_grads_with_norm_(self._parameters, self._limit, norm)
-        self.step()
-
-    def restore(self, parameter: nn.Parameter, moments: Mapping[str, Tensor]) -> None:
-        """Restores the saved "step", "exp_avg" and "exp_avg_sq" of ``parameter``."""
-        self.state[parameter] = {
-            kind: value.to(parameter.device) if kind == "step" else laid_out_as(parameter, value)
-            for kind, value in moments.items()
-        }
-
-    def _update_on_gpu(self, gradients: Sequence[Tensor | None], norm: Tensor) -> None:
         pairs = zip(self._parameters, gradients, strict=True)
         known = {p: laid_out_as(p, gradient) for p, gradient in pairs if gradient is not None}
         if not known:
             return
-        torch._foreach_mul_(list(known.values()), (self._limit / (norm + 1e-6)).clamp(max=1.0))  # as torch clips
-        for group in self.param_groups:
-            parameters = [parameter for parameter in group["params"] if parameter in known]
-            if not parameters:
-                continue
-            states = [self.state[parameter] or self._begin(parameter) for parameter in parameters]
-            steps, means, squares = ([state[kind] for state in states] for kind in ("step", "exp_avg", "exp_avg_sq"))
-            torch._foreach_add_(steps, 1)
-            beta1, beta2 = group["betas"]
-            settings = {"lr": group["lr"], "beta1": beta1, "beta2": beta2, "eps": group["eps"]}
-            settings |= {"weight_decay": group["weight_decay"], "amsgrad": False, "maximize": False}
-            own = [known[parameter] for parameter in parameters]
-            torch._fused_adamw_(parameters, own, means, squares, [], steps, **settings)
-        torch.autograd.graph.increment_version(list(known))  # not done by that call; autocast would keep stale casts
+        limit = self._settings.clip_norm or math.inf
+        torch._foreach_mul_(list(known.values()), (limit / (norm + 1e-6)).clamp(max=1.0))  # as torch clips
+        for encodes, is_of_muon in itertools.product((False, True), (False, True)):
+            some = [p for p in known if (p in self._encodes, p in self._matrices) == (encodes, is_of_muon)]
+            if some:
+                by = self._by_muon if is_of_muon else self._by_adamw
+                by(some, [known[p] for p in some], rate * encoder_rate if encodes else rate)
+        torch.autograd.graph.increment_version(list(known))  # not done by all; autocast would keep stale casts
 
-    def _begin(self, parameter: nn.Parameter) -> dict[str, Tensor]:
-        state = self.state[parameter]
-        state["step"] = torch.zeros((), device=parameter.device)
-        state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-        return state
+    def restore(self, parameter: nn.Parameter, moments: Mapping[str, Tensor]) -> None:
+        """Restores the saved ``state`` of ``parameter``, as far as it has one."""
+        known = {"exp_avg"} if parameter in self._matrices else moments.keys()
+        self.state[parameter] = {
+            kind: value.to(parameter.device) if kind == "step" else laid_out_as(parameter, value)
+            for kind, value in moments.items()
+            if kind in known
+        }
+
+    def _moments(self, parameters: Sequence[nn.Parameter], kind: str) -> list[Tensor]:
+        for p in parameters:
+            if kind not in self.state[p]:
+                self.state[p][kind] = torch.zeros_like(p) if kind != "step" else torch.zeros((), device=p.device)
+        return [self.state[p][kind] for p in parameters]
+
+    def _by_adamw(self, parameters: list[nn.Parameter], gradients: list[Tensor], rate: float) -> None:
+        steps, means, squares = (self._moments(parameters, kind) for kind in ("step", "exp_avg", "exp_avg_sq"))
+        settings = {name: getattr(self._settings, name) for name in ("beta1", "beta2", "eps", "weight_decay")}
+        settings |= {"lr": rate, "amsgrad": False, "maximize": False}
+        torch._foreach_add_(steps, 1)
+        torch._fused_adamw_(parameters, gradients, means, squares, [], steps, **settings)
+
+    def _by_muon(self, parameters: list[nn.Parameter], gradients: list[Tensor], rate: float) -> None:
+        momenta = self._moments(parameters, "exp_avg")
+        torch._foreach_lerp_(momenta, gradients, 1 - MOMENTUM)
+        updates = [update.flatten(1) for update in torch._foreach_lerp(gradients, momenta, MOMENTUM)]
+        sizes = [-rate * UPDATE_SIZE * max(update.shape) ** 0.5 for update in updates]
+        changes = zip(parameters, orthogonalized(updates), strict=True)
+        changes = [laid_out_as(p, change.reshape(p.shape)) for p, change in changes]
+        torch._foreach_mul_(changes, sizes)
+        torch._foreach_mul_(parameters, 1 - rate * self._settings.weight_decay)
+        torch._foreach_add_(parameters, changes)
+
+
+def is_matrix(name: str, parameter: Tensor) -> bool:
+    """Whether Muon updates ``parameter``: a matrix behind the first layer of the dynamics and before its last one."""
+    is_outside = name.startswith(("dynamics.net.stem.", "dynamics.net.head.fc2.", "dynamics.priors."))
+    return not is_outside and parameter.ndim >= 2 and min(parameter.flatten(1).shape) >= SMALLEST_SIDE
+
+
+def orthogonalized(matrices: Sequence[Tensor]) -> list[Tensor]:
+    """Matrices with the same singular vectors and singular values of 0.7 to 1.2; small ones are smaller.
+
+    By Newton-Schulz iterations, in bfloat16 on a GPU; matrices of one shape are computed together. A CPU uses one
+    thread, since BLAS rounds by their number.
+    """
+    n_threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return _orthogonalized(matrices)
+    finally:
+        torch.set_num_threads(n_threads)
+
+
+def _orthogonalized(matrices: Sequence[Tensor]) -> list[Tensor]:
+    wide = [matrix if matrix.shape[0] <= matrix.shape[1] else matrix.mT for matrix in matrices]
+    of_shape, a, b, c = defaultdict(list), *NEWTON_SCHULZ
+    for index, matrix in enumerate(wide):
+        of_shape[matrix.shape].append(index)
+    for members in of_shape.values():
+        x = torch.stack([wide[index] for index in members])
+        x = x / x.norm(dim=(1, 2), keepdim=True).clamp(min=torch.finfo(x.dtype).tiny)
+        x = x.bfloat16() if x.is_cuda else x
+        for _ in range(ITERATIONS):
+            gram = x @ x.mT
+            x = torch.baddbmm(x, torch.baddbmm(gram, gram, gram, beta=b, alpha=c), x, beta=a)
+        for index, made in zip(members, x.to(matrices[0].dtype).unbind(), strict=True):
+            wide[index] = made
+    return [y if x.shape[0] <= x.shape[1] else y.mT for x, y in zip(matrices, wide, strict=True)]
 
 
 @torch.no_grad()
