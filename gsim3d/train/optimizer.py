@@ -28,9 +28,9 @@ ITERATIONS = 5
 class Optimizer:
     """Muon for weight matrices and AdamW for other parameters, with explicit gradients and clipping at a global norm.
 
-    Matrices are those inside of the networks (:func:`is_matrix`); a convolution's weight is one of output channels x
-    the rest. Muon sets the singular values of their momentum to about 1 and scales it by ``0.2 sqrt(longer side)``, so
-    that the learning rate and weight decay of AdamW fit.
+    Matrices have sides of at least 16; a convolution's weight is one of output channels x the rest. Muon sets the
+    singular values of their momentum to about 1 and scales it by ``0.2 sqrt(longer side)``, so that the learning rate
+    and weight decay of AdamW fit.
 
     Args:
         parameters: parameters by name; those of ``encoder.`` may have another learning rate.
@@ -47,7 +47,7 @@ class Optimizer:
     def __init__(self, parameters: Mapping[str, nn.Parameter], settings: OptimizerConfig):
         self._parameters, self._settings = list(parameters.values()), settings
         self._encodes = {p for name, p in parameters.items() if name.startswith("encoder.")}
-        self._matrices = {p for name, p in parameters.items() if settings.muon and is_matrix(name, p)}
+        self._matrices = {p for p in self._parameters if settings.muon and is_matrix(p)}
         self.state: dict[nn.Parameter, dict[str, Tensor]] = defaultdict(dict)
 
     @torch.no_grad()
@@ -101,10 +101,9 @@ class Optimizer:
         torch._foreach_add_(parameters, changes)
 
 
-def is_matrix(name: str, parameter: Tensor) -> bool:
-    """Whether Muon updates ``parameter``: a matrix behind the first layer of the dynamics and before its last one."""
-    is_outside = name.startswith(("dynamics.net.stem.", "dynamics.net.head.fc2.", "dynamics.priors."))
-    return not is_outside and parameter.ndim >= 2 and min(parameter.flatten(1).shape) >= SMALLEST_SIDE
+def is_matrix(parameter: Tensor) -> bool:
+    """Whether Muon updates ``parameter``."""
+    return parameter.ndim >= 2 and min(parameter.flatten(1).shape) >= SMALLEST_SIDE
 
 
 def orthogonalized(matrices: Sequence[Tensor]) -> list[Tensor]:
