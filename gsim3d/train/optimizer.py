@@ -92,13 +92,19 @@ class Optimizer:
     def _by_muon(self, parameters: list[nn.Parameter], gradients: list[Tensor], rate: float) -> None:
         momenta = self._moments(parameters, "exp_avg")
         torch._foreach_lerp_(momenta, gradients, 1 - MOMENTUM)
-        updates = [update.flatten(1) for update in torch._foreach_lerp(gradients, momenta, MOMENTUM)]
-        sizes = [-rate * UPDATE_SIZE * max(update.shape) ** 0.5 for update in updates]
-        changes = zip(parameters, orthogonalized(updates), strict=True)
-        changes = [laid_out_as(p, change.reshape(p.shape)) for p, change in changes]
+        updates = [_channels_last(update) for update in torch._foreach_lerp(gradients, momenta, MOMENTUM)]
+        matrices = orthogonalized([update.flatten(1) for update in updates])
+        sizes = [-rate * UPDATE_SIZE * max(matrix.shape) ** 0.5 for matrix in matrices]
+        changes = [matrix.reshape(update.shape) for matrix, update in zip(matrices, updates, strict=True)]
+        changes = [laid_out_as(p, _channels_last(x, back=True)) for p, x in zip(parameters, changes, strict=True)]
         torch._foreach_mul_(changes, sizes)
         torch._foreach_mul_(parameters, 1 - rate * self._settings.weight_decay)
         torch._foreach_add_(parameters, changes)
+
+
+def _channels_last(x: Tensor, back: bool = False) -> Tensor:
+    """A 2D convolution's weight in the order in which it lies in memory, or ``back`` in its own; others as they are."""
+    return x.movedim(*((-1, 1) if back else (1, -1))) if x.dim() == 4 else x
 
 
 def is_matrix(parameter: Tensor) -> bool:
