@@ -69,12 +69,10 @@ class Optimizer:
 
     def restore(self, parameter: nn.Parameter, moments: Mapping[str, Tensor]) -> None:
         """Restores the saved ``state`` of ``parameter``, as far as it has one."""
-        known = {"exp_avg"} if parameter in self._matrices else moments.keys()
-        self.state[parameter] = {
-            kind: value.to(parameter.device) if kind == "step" else laid_out_as(parameter, value)
-            for kind, value in moments.items()
-            if kind in known
-        }
+        kinds = ("exp_avg",) if parameter in self._matrices else ("step", "exp_avg", "exp_avg_sq")
+        for kind in kinds:
+            value = moments[kind].to(parameter.device)
+            self.state[parameter][kind] = value if kind == "step" else laid_out_as(parameter, value)
 
     def _moments(self, parameters: Sequence[nn.Parameter], kind: str) -> list[Tensor]:
         for p in parameters:
@@ -95,8 +93,8 @@ class Optimizer:
         updates = [_channels_last(update) for update in torch._foreach_lerp(gradients, momenta, MOMENTUM)]
         matrices = orthogonalized([update.flatten(1) for update in updates])
         sizes = [-rate * UPDATE_SIZE * max(matrix.shape) ** 0.5 for matrix in matrices]
-        changes = [matrix.reshape(update.shape) for matrix, update in zip(matrices, updates, strict=True)]
-        changes = [laid_out_as(p, _channels_last(x, back=True)) for p, x in zip(parameters, changes, strict=True)]
+        changes = zip(parameters, map(torch.Tensor.reshape_as, matrices, updates), strict=True)
+        changes = [laid_out_as(p, _channels_last(change, back=True)) for p, change in changes]
         torch._foreach_mul_(changes, sizes)
         torch._foreach_mul_(parameters, 1 - rate * self._settings.weight_decay)
         torch._foreach_add_(parameters, changes)
@@ -120,13 +118,6 @@ def orthogonalized(matrices: Sequence[Tensor]) -> list[Tensor]:
     """
     n_threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    try:
-        return _orthogonalized(matrices)
-    finally:
-        torch.set_num_threads(n_threads)
-
-
-def _orthogonalized(matrices: Sequence[Tensor]) -> list[Tensor]:
     wide = [matrix if matrix.shape[0] <= matrix.shape[1] else matrix.mT for matrix in matrices]
     of_shape, a, b, c = defaultdict(list), *NEWTON_SCHULZ
     for index, matrix in enumerate(wide):
@@ -140,6 +131,7 @@ def _orthogonalized(matrices: Sequence[Tensor]) -> list[Tensor]:
             x = torch.baddbmm(x, torch.baddbmm(gram, gram, gram, beta=b, alpha=c), x, beta=a)
         for index, made in zip(members, x.to(matrices[0].dtype).unbind(), strict=True):
             wide[index] = made
+    torch.set_num_threads(n_threads)
     return [y if x.shape[0] <= x.shape[1] else y.mT for x, y in zip(matrices, wide, strict=True)]
 
 
