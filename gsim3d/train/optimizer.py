@@ -18,11 +18,9 @@ START_DIVISOR = 25  # initial learning rate = peak / START_DIVISOR
 END_DIVISOR = 1e4  # final learning rate = initial / END_DIVISOR
 FIRST_SCALE, LARGEST_SCALE = 2.0**16, 2.0**24
 STEPS_TO_DOUBLE = 2000  # consecutive finite steps after which the loss scale doubles
-SMALLEST_SIDE = 16  # of the matrices that Muon updates
-MOMENTUM = 0.95  # of Muon
+SMALLEST_SIDE, MOMENTUM = 16, 0.95  # of Muon: of the matrices that it updates, and its momentum
 UPDATE_SIZE = 0.2  # root mean square of an update of Muon at rate 1, about that of AdamW (Liu et al. 2025)
-NEWTON_SCHULZ = (3.4445, -4.775, 2.0315)  # coefficients of x, x^3 and x^5
-ITERATIONS = 5
+NEWTON_SCHULZ, ITERATIONS = (3.4445, -4.775, 2.0315), 5  # coefficients of x, x^3 and x^5
 
 
 class Optimizer:
@@ -58,12 +56,12 @@ class Optimizer:
         known = {p: laid_out_as(p, gradient) for p, gradient in pairs if gradient is not None}
         if not known:
             return
-        limit = self._settings.clip_norm or math.inf
-        torch._foreach_mul_(list(known.values()), (limit / (norm + 1e-6)).clamp(max=1.0))  # as torch clips
+        share = (self._settings.clip_norm or math.inf) / (norm + 1e-6)  # as torch clips
+        torch._foreach_mul_(list(known.values()), share.clamp(max=1.0))
         for encodes, is_of_muon in itertools.product((False, True), (False, True)):
             some = [p for p in known if (p in self._encodes, p in self._matrices) == (encodes, is_of_muon)]
+            by = self._by_muon if is_of_muon else self._by_adamw
             if some:
-                by = self._by_muon if is_of_muon else self._by_adamw
                 by(some, [known[p] for p in some], rate * encoder_rate if encodes else rate)
         torch.autograd.graph.increment_version(list(known))  # not done by all; autocast would keep stale casts
 
@@ -118,6 +116,13 @@ def orthogonalized(matrices: Sequence[Tensor]) -> list[Tensor]:
     """
     n_threads = torch.get_num_threads()
     torch.set_num_threads(1)
+    try:
+        return _orthogonalized(matrices)
+    finally:
+        torch.set_num_threads(n_threads)
+
+
+def _orthogonalized(matrices: Sequence[Tensor]) -> list[Tensor]:
     wide = [matrix if matrix.shape[0] <= matrix.shape[1] else matrix.mT for matrix in matrices]
     of_shape, a, b, c = defaultdict(list), *NEWTON_SCHULZ
     for index, matrix in enumerate(wide):
@@ -131,7 +136,6 @@ def orthogonalized(matrices: Sequence[Tensor]) -> list[Tensor]:
             x = torch.baddbmm(x, torch.baddbmm(gram, gram, gram, beta=b, alpha=c), x, beta=a)
         for index, made in zip(members, x.to(matrices[0].dtype).unbind(), strict=True):
             wide[index] = made
-    torch.set_num_threads(n_threads)
     return [y if x.shape[0] <= x.shape[1] else y.mT for x, y in zip(matrices, wide, strict=True)]
 
 

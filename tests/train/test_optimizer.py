@@ -1,4 +1,4 @@
-"""The optimizer's step is that of torch's AdamW behind torch's clipping, on every path."""
+"""The optimizer's step is that of torch's AdamW and Muon behind torch's clipping."""
 
 import copy
 import dataclasses
