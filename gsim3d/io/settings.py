@@ -67,7 +67,7 @@ def upgraded(cls: type, content: Any) -> Any:
 
     A class may have ``RENAMED``, old names of its settings to new ones, and ``REMOVED``, settings that are gone to the
     value with which they did nothing (``...``: with any value). What did something stays, for :func:`from_dict` to
-    refuse. ``ADDED``: settings that came later, to the value that stands for what was done before.
+    refuse.
     """
     if not isinstance(content, dict):
         return content
@@ -83,7 +83,7 @@ def upgraded(cls: type, content: Any) -> Any:
         elif typing.get_origin(hint) is tuple and dataclasses.is_dataclass(typing.get_args(hint)[0]):
             value = [upgraded(typing.get_args(hint)[0], item) for item in value]
         result[name] = value
-    return getattr(cls, "ADDED", {}) | result
+    return result
 
 
 def _old_name(cls: type, name: str) -> str:

@@ -24,11 +24,11 @@ NEWTON_SCHULZ, ITERATIONS = (3.4445, -4.775, 2.0315), 5  # coefficients of x, x^
 
 
 class Optimizer:
-    """Muon for weight matrices and AdamW for other parameters, with explicit gradients and clipping at a global norm.
+    """AdamW, with ``settings.muon`` Muon for weight matrices, with explicit gradients and clipping at a global norm.
 
     Matrices have sides of at least 16; a convolution's weight is one of output channels x the rest. Muon sets the
-    singular values of their momentum to about 1 and scales it by ``0.2 sqrt(longer side)``, so that the learning rate
-    and weight decay of AdamW fit.
+    singular values of their momentum to about 1 and scales it by ``0.2 sqrt(longer side)``, to about the size of an
+    update of AdamW.
 
     Args:
         parameters: parameters by name; those of ``encoder.`` may have another learning rate.

@@ -20,7 +20,7 @@ from gsim3d.io.files import read_yaml
 from gsim3d.io.settings import from_dict, to_dict, upgraded
 from gsim3d.priors import PriorConfig
 from gsim3d.train import restore
-from gsim3d.train.config import DataConfig, OptimizerConfig, PhaseConfig, TrainConfig, check_same_run
+from gsim3d.train.config import DataConfig, PhaseConfig, TrainConfig
 from gsim3d.train.restore import build_simulator, model_config
 
 
@@ -255,11 +255,3 @@ def test_documented_training_equals_published_one():
     assert (optimizer.weight_decay, optimizer.clip_norm, optimizer.ema_decay) == (1e-3, 0.5, 0)
     (phase,) = config.phases
     assert (phase.horizon, phase.target_views, phase.learning_rate, phase.warm_up) == (12, 5, 2e-4, 0.01)
-
-
-def test_runs_before_muon_go_on_with_adamw(tmp_path):
-    saved = to_dict(TrainConfig())
-    del saved["optimizer"]["muon"]
-    check_same_run(TrainConfig(optimizer=OptimizerConfig(muon=False)), saved, tmp_path)
-    with pytest.raises(InputError, match="was started with a different 'optimizer'"):
-        check_same_run(TrainConfig(), saved, tmp_path)

@@ -105,7 +105,7 @@ def matrices_of(device):
 
 
 def test_matrices_are_updated_as_by_muon_of_torch(device):
-    config = OptimizerConfig(weight_decay=0.1)
+    config = OptimizerConfig(muon=True, weight_decay=0.1)
     ours, theirs = (list(matrices_of(device).parameters()) for _ in range(2))
     first = [p.detach().clone() for p in ours]
     optimizer = Optimizer({f"{'encoder' if k < 2 else 'net'}.{k}": p for k, p in enumerate(ours)}, config)
@@ -152,10 +152,10 @@ def test_orthogonalized_matrices_keep_their_singular_vectors(shape, device):
 def test_muon_resumes_with_the_same_bits(device):
     first = list(matrices_of(device).parameters())
     names = [f"{'encoder' if k < 2 else 'net'}.{k}" for k in range(len(first))]
-    optimizer = Optimizer(dict(zip(names, first, strict=True)), OptimizerConfig())
+    optimizer = Optimizer(dict(zip(names, first, strict=True)), OptimizerConfig(muon=True))
     take(optimizer, draw(first, 1), RATES[0])
     again = [nn.Parameter(copy.deepcopy(p.detach())) for p in first]
-    resumed = Optimizer(dict(zip(names, again, strict=True)), OptimizerConfig())
+    resumed = Optimizer(dict(zip(names, again, strict=True)), OptimizerConfig(muon=True))
     for p, q in zip(first, again, strict=True):
         if optimizer.state[p]:
             resumed.restore(q, {kind: value.cpu().clone() for kind, value in optimizer.state[p].items()})

@@ -36,9 +36,7 @@ STAGES = (
     PhaseConfig(steps=2, horizon=2, batch=2, target_views=2, learning_rate=1e-4),
 )
 LAYER = dataclasses.replace(CONFIG, phases=STAGES)
-# Muon raises small singular values, and what rounding changes in them: within the tolerance for layer norms alone.
-ADAMW = dataclasses.replace(LAYER, optimizer=dataclasses.replace(LAYER.optimizer, muon=False))
-BATCH = dataclasses.replace(ADAMW, model={"dynamics": {"norm": "batch", "zero_init": False}}, recompute=("steps",))
+BATCH = dataclasses.replace(LAYER, model={"dynamics": {"norm": "batch", "zero_init": False}}, recompute=("steps",))
 UNEVEN = dataclasses.replace(LAYER, phases=(dataclasses.replace(STAGES[1], batch=3),))
 RUNS = {"layer": LAYER, "batch": BATCH, "uneven": UNEVEN, "captured": UNEVEN}
 # float32: a batch is added in another order, and AdamW turns a gradient near zero into a step of full size. Relative;

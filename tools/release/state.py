@@ -1,7 +1,7 @@
 """State of a training run that goes on from machine to machine: one file of about a byte a weight.
 
 ``NAME.state.safetensors`` holds the averaged weights as int8 in blocks of 64 with a scale each (vectors in float32),
-AdamW's averages of squared gradients (a matrix's as means over its rows and columns: Shazeer and Stern 2018,
+AdamW's averages of squared gradients as means over rows and columns of each matrix (Shazeer and Stern 2018,
 "Adafactor"), the training curve, and as metadata what :class:`Progress` says. The next run begins at the averaged
 weights, which are less noisy than those of the last step, with first moments of zero and a warm-up.
 ``NAME.weights.safetensors`` beside it is a checkpoint with the same weights in bfloat16, to predict with.
