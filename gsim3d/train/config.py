@@ -139,10 +139,8 @@ class LossConfig:
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """AdamW, for weight matrices also Muon, with gradient clipping and weight averaging."""
+    """AdamW with gradient clipping and weight averaging."""
 
-    #: update weight matrices by Muon, all others by AdamW, at the same learning rate
-    muon: bool = False
     beta1: float = 0.9  #: decay of the first moment, below 1
     beta2: float = 0.999  #: decay of the second moment, below 1
     eps: float = 1e-8  #: added to the root of the second moment
@@ -205,7 +203,7 @@ class TrainConfig:
     effects: dict = dataclasses.field(default_factory=dict)
     data: DataConfig = DataConfig()  #: frames and views of a sample
     loss: LossConfig = LossConfig()  #: weights of the loss
-    optimizer: OptimizerConfig = OptimizerConfig()  #: AdamW, Muon and weight averaging
+    optimizer: OptimizerConfig = OptimizerConfig()  #: AdamW and weight averaging
     precision: PrecisionConfig = PrecisionConfig()  #: "fp32", "bf16" or "fp16" for each part of the model
     #: activation checkpointing of "encoder", "steps" (each simulated step) or "images"; saves memory with equal
     #: results. ``model.dynamics.checkpointing`` additionally checkpoints the blocks within a step.

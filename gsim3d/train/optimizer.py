@@ -1,6 +1,5 @@
-"""Muon and AdamW for many small tensors, learning-rate schedule, weight averaging, loss scaling, deterministic mode."""
+"""AdamW for many small tensors, learning-rate schedule, weight averaging, loss scaling, deterministic mode."""
 
-import itertools
 import math
 import os
 from collections import defaultdict
@@ -17,35 +16,27 @@ from gsim3d.train.config import OptimizerConfig
 START_DIVISOR = 25  # initial learning rate = peak / START_DIVISOR
 END_DIVISOR = 1e4  # final learning rate = initial / END_DIVISOR
 FIRST_SCALE, LARGEST_SCALE = 2.0**16, 2.0**24
+MOMENTS = "step", "exp_avg", "exp_avg_sq"
 STEPS_TO_DOUBLE = 2000  # consecutive finite steps after which the loss scale doubles
-SMALLEST_SIDE, MOMENTUM = 16, 0.95  # of Muon: of the matrices that it updates, and its momentum
-UPDATE_SIZE = 0.2  # root mean square of an update of Muon at rate 1, about that of AdamW (Liu et al. 2025)
-NEWTON_SCHULZ, ITERATIONS = (3.4445, -4.775, 2.0315), 5  # coefficients of x, x^3 and x^5
 
 
 class Optimizer:
-    """AdamW, with ``settings.muon`` Muon for weight matrices, with explicit gradients and clipping at a global norm.
-
-    Matrices have sides of at least 16; a convolution's weight is one of output channels x the rest. Muon sets the
-    singular values of their momentum to about 1 and scales it by ``0.2 sqrt(longer side)``, to about the size of an
-    update of AdamW.
+    """AdamW with explicit gradients and clipping at a global norm.
 
     Args:
         parameters: parameters by name; those of ``encoder.`` may have another learning rate.
         settings: hyperparameters.
 
     Attributes:
-        state: "exp_avg" of a parameter and, of AdamW, "step" and "exp_avg_sq"; empty before its first update.
+        state: "step", "exp_avg" and "exp_avg_sq" of a parameter; empty before its first update.
 
     Source:
-        Jordan et al. 2024, "Muon: an optimizer for hidden layers in neural networks"; Liu et al. 2025, "Muon is
-        scalable for LLM training"; Loshchilov and Hutter 2019, "Decoupled weight decay regularization".
+        Loshchilov and Hutter 2019, "Decoupled weight decay regularization".
     """
 
     def __init__(self, parameters: Mapping[str, nn.Parameter], settings: OptimizerConfig):
         self._parameters, self._settings = list(parameters.values()), settings
         self._encodes = {p for name, p in parameters.items() if name.startswith("encoder.")}
-        self._matrices = {p for p in self._parameters if settings.muon and is_matrix(p)}
         self.state: dict[nn.Parameter, dict[str, Tensor]] = defaultdict(dict)
 
     @torch.no_grad()
@@ -58,17 +49,14 @@ class Optimizer:
             return
         share = (self._settings.clip_norm or math.inf) / (norm + 1e-6)  # as torch clips
         torch._foreach_mul_(list(known.values()), share.clamp(max=1.0))
-        for encodes, is_of_muon in itertools.product((False, True), (False, True)):
-            some = [p for p in known if (p in self._encodes, p in self._matrices) == (encodes, is_of_muon)]
-            by = self._by_muon if is_of_muon else self._by_adamw
-            if some:
-                by(some, [known[p] for p in some], rate * encoder_rate if encodes else rate)
+        for encodes in (False, True):
+            if some := [p for p in known if (p in self._encodes) == encodes]:
+                self._step(some, [known[p] for p in some], rate * encoder_rate if encodes else rate)
         torch.autograd.graph.increment_version(list(known))  # not done by all; autocast would keep stale casts
 
     def restore(self, parameter: nn.Parameter, moments: Mapping[str, Tensor]) -> None:
         """Restores the saved ``state`` of ``parameter``, as far as it has one."""
-        kinds = ("exp_avg",) if parameter in self._matrices else ("step", "exp_avg", "exp_avg_sq")
-        for kind in kinds:
+        for kind in MOMENTS:
             value = moments[kind].to(parameter.device)
             self.state[parameter][kind] = value if kind == "step" else laid_out_as(parameter, value)
 
@@ -78,65 +66,12 @@ class Optimizer:
                 self.state[p][kind] = torch.zeros_like(p) if kind != "step" else torch.zeros((), device=p.device)
         return [self.state[p][kind] for p in parameters]
 
-    def _by_adamw(self, parameters: list[nn.Parameter], gradients: list[Tensor], rate: float) -> None:
-        steps, means, squares = (self._moments(parameters, kind) for kind in ("step", "exp_avg", "exp_avg_sq"))
+    def _step(self, parameters: list[nn.Parameter], gradients: list[Tensor], rate: float) -> None:
+        steps, means, squares = (self._moments(parameters, kind) for kind in MOMENTS)
         settings = {name: getattr(self._settings, name) for name in ("beta1", "beta2", "eps", "weight_decay")}
         settings |= {"lr": rate, "amsgrad": False, "maximize": False}
         torch._foreach_add_(steps, 1)
         torch._fused_adamw_(parameters, gradients, means, squares, [], steps, **settings)
-
-    def _by_muon(self, parameters: list[nn.Parameter], gradients: list[Tensor], rate: float) -> None:
-        momenta = self._moments(parameters, "exp_avg")
-        torch._foreach_lerp_(momenta, gradients, 1 - MOMENTUM)
-        updates = [_channels_last(update) for update in torch._foreach_lerp(gradients, momenta, MOMENTUM)]
-        matrices = orthogonalized([update.flatten(1) for update in updates])
-        sizes = [-rate * UPDATE_SIZE * max(matrix.shape) ** 0.5 for matrix in matrices]
-        changes = zip(parameters, map(torch.Tensor.reshape_as, matrices, updates), strict=True)
-        changes = [laid_out_as(p, _channels_last(change, back=True)) for p, change in changes]
-        torch._foreach_mul_(changes, sizes)
-        torch._foreach_mul_(parameters, 1 - rate * self._settings.weight_decay)
-        torch._foreach_add_(parameters, changes)
-
-
-def _channels_last(x: Tensor, back: bool = False) -> Tensor:
-    """A 2D convolution's weight in the order in which it lies in memory, or ``back`` in its own; others as they are."""
-    return x.movedim(*((-1, 1) if back else (1, -1))) if x.dim() == 4 else x
-
-
-def is_matrix(parameter: Tensor) -> bool:
-    """Whether Muon updates ``parameter``."""
-    return parameter.ndim >= 2 and min(parameter.flatten(1).shape) >= SMALLEST_SIDE
-
-
-def orthogonalized(matrices: Sequence[Tensor]) -> list[Tensor]:
-    """Matrices with the same singular vectors and singular values of 0.7 to 1.2; small ones are smaller.
-
-    By Newton-Schulz iterations, in bfloat16 on a GPU; matrices of one shape are computed together. A CPU uses one
-    thread, since BLAS rounds by their number.
-    """
-    n_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        return _orthogonalized(matrices)
-    finally:
-        torch.set_num_threads(n_threads)
-
-
-def _orthogonalized(matrices: Sequence[Tensor]) -> list[Tensor]:
-    wide = [matrix if matrix.shape[0] <= matrix.shape[1] else matrix.mT for matrix in matrices]
-    of_shape, a, b, c = defaultdict(list), *NEWTON_SCHULZ
-    for index, matrix in enumerate(wide):
-        of_shape[matrix.shape].append(index)
-    for members in of_shape.values():
-        x = torch.stack([wide[index] for index in members])
-        x = x / x.norm(dim=(1, 2), keepdim=True).clamp(min=torch.finfo(x.dtype).tiny)
-        x = x.bfloat16() if x.is_cuda else x
-        for _ in range(ITERATIONS):
-            gram = x @ x.mT
-            x = torch.baddbmm(x, torch.baddbmm(gram, gram, gram, beta=b, alpha=c), x, beta=a)
-        for index, made in zip(members, x.to(matrices[0].dtype).unbind(), strict=True):
-            wide[index] = made
-    return [y if x.shape[0] <= x.shape[1] else y.mT for x, y in zip(matrices, wide, strict=True)]
 
 
 @torch.no_grad()
