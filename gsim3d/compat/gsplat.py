@@ -14,11 +14,12 @@ from torch import Tensor
 
 from gsim3d.cameras import Cameras
 from gsim3d.errors import InputError, check_one_of
-from gsim3d.ops._arguments import check_tensors, check_whole, constant
+from gsim3d.ops._arguments import check_floating, check_numbers, check_tensors, check_whole, constant
 from gsim3d.ops.projection import Projection, project_gaussians, sh_to_color
-from gsim3d.ops.raster import Rendering
+from gsim3d.ops.raster import LARGEST, Rendering
 from gsim3d.ops.raster_projected import rasterize_projected
 
+OP = "rasterization"
 LENSES = {"pinhole": "pinhole", "ortho": "orthographic", "fisheye": "fisheye"}
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
@@ -27,6 +28,9 @@ NO_TILES = ("tiles_per_gauss", "isect_ids", "flatten_ids", "isect_offsets", "til
 
 class Meta(dict):
     """What :func:`rasterization` knows of every Gaussian in every image; lists of tiles are refused by name."""
+
+    def get(self, key: str, default: Any = None) -> Any:
+        return self[key] if key in self or key in NO_TILES else default
 
     def __missing__(self, key: str) -> Any:
         if key in NO_TILES:
@@ -153,7 +157,7 @@ def rasterization(
     options["covars"] = None if covars is None else covars.flatten(0, -3)
     flat_opacities = opacities.flatten()
     projection = project_gaussians(
-        means.flatten(0, -2), *shapes, cameras, opacities=flat_opacities, n_clouds=n_batches, **options
+        means.flatten(0, -2), *shapes, cameras, opacities=flat_opacities, n_clouds=n_batches, check=False, **options
     )
     values = _colors(colors, sh_degree, means, viewmats) if with_color else means.new_zeros(n_images * n, 0)
     alphas = flat_opacities
@@ -179,6 +183,7 @@ def rasterization(
     image = rasterize_projected(
         *(means2d.flatten(0, -2), conics, depths, alphas, values),
         width=width, height=height, cu_pairs=cu_pairs, background=backgrounds, absolute=absolute,
+        check=False,
     )  # fmt: skip
     color, alpha = _images(image, render_mode if with_depth else "RGB", (*batch, n_cameras))
     return color, alpha, meta
@@ -211,6 +216,10 @@ def _check(camera_model: str, means, viewmats, Ks, opacities, optional: dict[str
         if value is None or value.shape != (*batch, *shape):
             got = None if value is None else list(value.shape)
             raise ValueError(f"rasterization: {name} must be {[*batch, *shape]}; got {got}")
+    check_floating(OP, {name: given.get(name) for name in ("colors", "backgrounds")}, means=means)
+    check_numbers(OP, largest_of=LARGEST, means=means, **given)
+    check_numbers(OP, negative=False, scales=given.get("scales"))
+    check_numbers(OP, largest_of=1.0, negative=False, opacities=opacities)
 
 
 def _lens(lens: str, radial: Tensor | None, tangential: Tensor | None, n_images: int) -> tuple[str, Tensor | None]:

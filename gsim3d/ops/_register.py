@@ -202,6 +202,7 @@ def _register(name: str, op: str, backward: Callable, setup: Callable | None, wi
     overload = getattr(torch.ops.gsim3d, name).default
     arguments = overload._schema.arguments
     names, defaults = [a.name for a in arguments], [a.default_value for a in arguments]
+    places = {name: names.index(name) for name in without}
 
     def compute(keyset, inputs):
         with torch._C._AutoDispatchBelowAutograd():
@@ -229,7 +230,7 @@ def _register(name: str, op: str, backward: Callable, setup: Callable | None, wi
         if not torch.is_grad_enabled() or not torch._C._any_requires_grad(*inputs):
             return compute(keyset, inputs)
         if without:
-            refuse(op, {name: value for name, value in zip(names, inputs) if name in without})
+            refuse(op, {name: inputs[k] for name, k in places.items() if k < len(inputs)})
         if torch._C._are_functorch_transforms_active() and not torch.compiler.is_compiling():  # not by :func:`call`
             said = "has no transforms of torch.func; use torch.autograd.grad"
             raise GradientError(f"{op}: {said}", op=op, argument=None, order=1)

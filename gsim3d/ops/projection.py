@@ -69,6 +69,7 @@ def project_gaussians(
     dilation: float = 0.3,
     jacobian: str = "exact",
     antialiased: bool = False,
+    check: bool = True,
 ) -> Projection:
     """Projects clouds of 3D Gaussians into images, for :func:`rasterize_projected`.
 
@@ -96,6 +97,7 @@ def project_gaussians(
         dilation: px^2, added to both variances.
         jacobian: as of :func:`rasterize_gaussians`, for pinholes.
         antialiased: the opacities will be multiplied by the compensation (Mip-Splatting): it counts for the radii.
+        check: look at the arguments before the kernel does; a caller that has done so leaves it out.
     Returns:
         Projection, dtype of ``means``.
     Gradients:
@@ -121,10 +123,11 @@ def project_gaussians(
         >>> seen.means2d, seen.radii
         (tensor([[6., 4.]]), tensor([[4, 4]], dtype=torch.int32))
     """
-    given = {"quats": quats, "scales": scales, "covars": covars, "opacities": opacities, "distortion": distortion}
-    tensors = {"means": means} | {name: value for name, value in given.items() if value is not None}
-    sizes = {name: size for name, size in (("n_clouds", n_clouds), ("n_pairs", n_pairs)) if size is not None}
-    _check(tensors, cameras, cu_rows, sizes, lens, jacobian)
+    if check:
+        given = {"quats": quats, "scales": scales, "covars": covars, "opacities": opacities, "distortion": distortion}
+        tensors = {"means": means} | {name: value for name, value in given.items() if value is not None}
+        sizes = {name: size for name, size in (("n_clouds", n_clouds), ("n_pairs", n_pairs)) if size is not None}
+        _check(tensors, cameras, cu_rows, sizes, lens, jacobian)
     check_real(OP, near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, dilation=dilation)
     n, n_images, device, image_cloud = means.shape[0], len(cameras), means.device, cameras.image_cloud
     if n_clouds is not None:

@@ -34,6 +34,7 @@ def rasterize_projected(
     background: Tensor | None = None,
     absolute: Tensor | None = None,
     cutoff: str = "exact",
+    check: bool = True,
 ) -> Rendering:
     """Renders what :func:`project_gaussians` returns, as :func:`rasterize_gaussians` does in one call.
 
@@ -51,6 +52,7 @@ def rasterize_projected(
         absolute: [P, 2], zeros that ask for a gradient; theirs is the sum over pixels of the absolute values of what
             each adds to the gradient of ``means2d`` (AbsGS).
         cutoff: "exact" or "smooth", as of :func:`rasterize_gaussians`.
+        check: as of :func:`project_gaussians`.
     Returns:
         Rendering with ``color`` [I, H, W, D] and without features, dtype of ``means2d``.
     Gradients:
@@ -69,9 +71,13 @@ def rasterize_projected(
         >>> image.color.shape, round(float(image.alpha[0, 4, 4]), 3)
         (torch.Size([1, 8, 8, 5]), 0.441)
     """
-    rows = {"means2d": means2d, "conics": conics, "depths": depths, "opacities": opacities, "colors": colors}
-    optional = {"cu_pairs": cu_pairs, "background": background, "absolute": absolute}
-    _check(rows, {name: value for name, value in optional.items() if value is not None}, width, height, cutoff)
+    if check:
+        rows = {"means2d": means2d, "conics": conics, "depths": depths, "opacities": opacities, "colors": colors}
+        optional = {"cu_pairs": cu_pairs, "background": background, "absolute": absolute}
+        _check(rows, {name: value for name, value in optional.items() if value is not None}, cutoff)
+    check_whole(OP, width=width, height=height)
+    if not (0 < width < 2**16 and 0 < height < 2**16):
+        raise ValueError(f"{OP}: width and height must be in [1, 65535]; got {width} and {height}")
     device = means2d.device
     if cu_pairs is None:
         cu_pairs = constant(offsets, 1, means2d.shape[0], device=device)
@@ -101,12 +107,9 @@ def _first_three(channels: Tensor) -> Tensor:
     return channels if d == 3 else channels[:, :3] if d > 3 else F.pad(channels, (0, 3 - d))
 
 
-def _check(rows: dict[str, Tensor], optional: dict[str, Tensor], width: int, height: int, cutoff: str) -> None:
+def _check(rows: dict[str, Tensor], optional: dict[str, Tensor], cutoff: str) -> None:
     check_tensors(OP, **rows, **optional)
     check_floating(OP, {"colors": rows["colors"], "background": optional.get("background")}, means2d=rows["means2d"])
-    check_whole(OP, width=width, height=height)
-    if not (0 < width < 2**16 and 0 < height < 2**16):
-        raise ValueError(f"{OP}: width and height must be in [1, 65535]; got {width} and {height}")
     check_one_of(f"{OP}: cutoff", cutoff, ("exact", "smooth"))
     n = rows["means2d"].shape[0] if rows["means2d"].dim() else 0
     shapes = {"means2d": (n, 2), "conics": (n, 3), "depths": (n,), "opacities": (n,), "absolute": (n, 2)}
