@@ -18,37 +18,35 @@ __device__ bool sum_slots(const Job<T>& job, const Group& group, int64_t row, co
   const int n = seen ? group.n_slots(squares_of(bounds, kTile), squares_of(bounds, kQuarter)) : 0;
   const int lane = threadIdx.x % kWarp;
   const int64_t n_features = slots.n_columns;
-  // Adds slots i, i + stride, ... before `end` of those from `first` on, in this order; a bit for each that is live.
-  const auto add_some = [&](int64_t first, int i, int end, int stride, SlotSums<T>& to) {
-    bool used[kAtOnce];
-    SlotSums<T> some[kAtOnce];
-    unsigned bits = 0;
-#pragma unroll
-    for (int k = 0; k < kAtOnce; ++k) used[k] = i + k * stride < end && slots.live[first + i + k * stride];
-#pragma unroll
-    for (int k = 0; k < kAtOnce; ++k) some[k] = used[k] ? slots.sums[first + i + k * stride] : SlotSums<T>{};
-#pragma unroll
-    for (int k = 0; k < kAtOnce; ++k) {
-      bits |= unsigned{used[k]} << k;
-      for (int c = 0; c < kSlotValues; ++c) to.value[c] += some[k].value[c];
-    }
-    return bits;
-  };
+  const unsigned char* live = slots.live + slot_begin;
   bool any = seen && group.resumed;
   sums = any ? slots.unfinished[row] : SlotSums<T>{};
   for (int i = 0; i < n && n <= kAlone; i += kAtOnce) {
-    const unsigned bits = add_some(slot_begin, i, n, 1, sums);
-    any |= bits != 0;
-    for (int k = 0; k < kAtOnce && features; ++k)
-      for (int64_t c = 0; bits >> k & 1 && c < n_features; ++c)
+    bool used[kAtOnce];
+    SlotSums<T> some[kAtOnce];
+#pragma unroll
+    for (int k = 0; k < kAtOnce; ++k) used[k] = i + k < n && live[i + k];
+#pragma unroll
+    for (int k = 0; k < kAtOnce; ++k) some[k] = used[k] ? slots.sums[int64_t{slot_begin} + i + k] : SlotSums<T>{};
+#pragma unroll
+    for (int k = 0; k < kAtOnce; ++k) {
+      any |= used[k];
+      for (int c = 0; c < kSlotValues; ++c) sums.value[c] += some[k].value[c];
+      for (int64_t c = 0; used[k] && features && c < n_features; ++c)
         features[c] += slots.features[(int64_t{slot_begin} + i + k) * n_features + c];
+    }
   }
   for (unsigned owners = __ballot_sync(kFullWarp, n > kAlone); owners; owners &= owners - 1) {
     const int owner = __ffs(owners) - 1, n_shared = __shfl_sync(kFullWarp, n, owner);
     const int64_t begin = __shfl_sync(kFullWarp, slot_begin, owner);
     SlotSums<T> part{};
     bool some = false;
-    for (int i = lane; i < n_shared; i += kAtOnce * kWarp) some |= add_some(begin, i, n_shared, kWarp, part) != 0;
+    for (int i = lane; i < n_shared; i += kWarp) {
+      if (!slots.live[begin + i]) continue;
+      some = true;
+      const SlotSums<T> slot = slots.sums[begin + i];
+      for (int c = 0; c < kSlotValues; ++c) part.value[c] += slot.value[c];
+    }
     for (int step = kWarp / 2; step > 0; step /= 2)
       for (int c = 0; c < kSlotValues; ++c) part.value[c] += __shfl_xor_sync(kFullWarp, part.value[c], step);
     some = __any_sync(kFullWarp, some);
