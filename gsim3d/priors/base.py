@@ -116,7 +116,7 @@ class StepContext:
         self.runs = history.clouds.row_runs(self.newest)
         self.changes, self.awake, self.n_views = changes, None, None
         self._most_movable, self._share, self._shared = most_movable, share, {}
-        self._make_state = state or (lambda newest=self.newest: history.select_clouds(newest))  # without a cycle
+        self._make_state = state if state is not None else lambda newest=self.newest: history.select_clouds(newest)
 
     @property
     def state(self) -> Particles:
