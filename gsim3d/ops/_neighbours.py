@@ -93,7 +93,7 @@ def submanifold_pairs(keys: Tensor, kernel: Axes, dilation: Axes) -> tuple[Tenso
     found &= (steps != 0).any(1)[:, None]
     tap, tap_out = found.nonzero().unbind(1)
     shift = torch.tensor([(cube - k) // 2 for k in kernel], device=keys.device)
-    slot = (offsets + shift) @ torch.tensor([cube * cube, cube, 1], device=keys.device)
+    slot = ((offsets + shift) * torch.tensor([cube * cube, cube, 1], device=keys.device)).sum(1)
     return place[tap, tap_out], tap_out, _offsets(slot[tap], cube)
 
 

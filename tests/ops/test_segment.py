@@ -33,23 +33,32 @@ def test_forward(op, device):
 
 @EVERY_OP
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16], ids=str)
-def test_16_bit_rows_are_computed_in_float32(op, dtype):
-    x = rows(dtype)
-    assert torch.equal(OPS[op](x, CU), OPS[op](x.float(), CU).to(dtype))
+def test_16_bit_rows_are_computed_in_float32(op, dtype, device):
+    x, cu = rows(dtype).to(device), CU.to(device)
+    assert torch.equal(OPS[op](x, cu), OPS[op](x.float(), cu).to(dtype))
 
 
 @EVERY_OP
-def test_gradients_against_finite_differences(op):
-    x = rows().requires_grad_()
-    assert gradcheck(lambda x: OPS[op](x, CU), x, check_forward_ad=True)
-    assert gradgradcheck(lambda x: OPS[op](x, CU), x)
+def test_gradient_equals_that_of_the_loop(op, device):
+    x, cotangent = rows(), rows().cos()[: len(loop(op, rows()))]
+    (expected,) = torch.autograd.grad(loop(op, x.requires_grad_()), x, cotangent)
+    moved = rows().to(device).requires_grad_()
+    (found,) = torch.autograd.grad(OPS[op](moved, CU.to(device)), moved, cotangent.to(device))
+    torch.testing.assert_close(found.cpu(), expected)
 
 
 @EVERY_OP
-def test_vmap_equals_a_loop(op):
-    x = torch.stack([rows(), rows() + 1])
-    expected = torch.stack([OPS[op](each, CU) for each in x])
-    torch.testing.assert_close(torch.vmap(lambda each: OPS[op](each, CU))(x), expected)
+def test_gradients_against_finite_differences(op, device):
+    x, cu = rows().to(device).requires_grad_(), CU.to(device)
+    assert gradcheck(lambda x: OPS[op](x, cu), x, check_forward_ad=True)
+    assert gradgradcheck(lambda x: OPS[op](x, cu), x)
+
+
+@EVERY_OP
+def test_vmap_equals_a_loop(op, device):
+    x, cu = torch.stack([rows(), rows() + 1]).to(device), CU.to(device)
+    expected = torch.stack([OPS[op](each, cu) for each in x])
+    torch.testing.assert_close(torch.vmap(lambda each: OPS[op](each, cu))(x), expected)
 
 
 @EVERY_OP
@@ -59,10 +68,10 @@ def test_compiled(op):
 
 
 @EVERY_OP
-def test_large_scores_and_no_rows(op):
-    x = torch.full((9, 1), 1e4)
-    assert OPS[op](x, CU).isfinite().all()
-    assert OPS[op](x[:0], CU[:1]).shape == (0, 1)
+def test_large_scores_and_no_rows(op, device):
+    x, cu = torch.linspace(0, 1e4, 9, device=device)[:, None], CU.to(device)
+    assert OPS[op](x, cu).isfinite().all()
+    assert OPS[op](x[:0], cu[:1]).shape == (0, 1)
 
 
 @EVERY_OP

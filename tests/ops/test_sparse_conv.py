@@ -493,7 +493,7 @@ def test_pyramid_keeps_the_plan_of_large_kernels_for_gradients_only(devices):
         if index == 1:  # taps are summed in mirrored order
             assert relative_to_max(kept, anew) < 2**-7
         else:
-            assert_same_bits(kept, anew)
+            assert_same_bits(kept, anew, f"result {index}")
 
 
 def scene_for_bits():

@@ -1,5 +1,7 @@
 """Higher derivatives and the transforms of torch.func, against finite differences and plain loops in float64."""
 
+import functools
+
 import pytest
 import torch
 from torch.autograd import forward_ad, gradcheck, gradgradcheck
@@ -7,35 +9,39 @@ from torch.autograd import forward_ad, gradcheck, gradgradcheck
 from gsim3d import ops
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-ROWS, CU = torch.tensor([4, 0, 3, 1, 5, 2]), torch.tensor([0, 2, 2, 5])  # row 2 is in no segment, the second is empty
-TABLE = ops.PatchTable(ROWS, torch.tensor([0, 3, 3, 1, 2, 4]), CU, torch.tensor([0, 3, 4, 6]))
+CPU = torch.device("cpu")
+OPS = ("pool_max", "pool_mean", "unpool", "sparse_conv", "patch_attention")
+EVERY_OP = pytest.mark.parametrize("op", OPS)
 
 
 def values(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def stage() -> ops.Stage:
-    spec = ops.PyramidSpec(0.4, 0, (), (), (4,), ((3,),))
+@functools.cache
+def calls(device: torch.device) -> dict:
+    """Of each op a function and its inputs."""
+    # Row 2 is in no segment, the second is empty.
+    rows, cu = torch.tensor([4, 0, 3, 1, 5, 2], device=device), torch.tensor([0, 2, 2, 5], device=device)
+    keys, cu_keys = torch.tensor([0, 3, 3, 1, 2, 4], device=device), torch.tensor([0, 3, 4, 6], device=device)
+    table = ops.PatchTable(rows, keys, cu, cu_keys)
     zero, origin = torch.zeros(1, dtype=torch.int64), torch.zeros(1, 3, dtype=torch.float64)
-    return ops.build_pyramid(values(6, 3), torch.tensor([0, 6]), zero, zero, origin, spec).stages[0]
-
-
-STAGE = stage()
-CALLS = {
-    "pool_max": (lambda x: ops.pool_max(x, ROWS, CU), [values(6, 3)]),
-    "pool_mean": (lambda x: ops.pool_mean(x, ROWS, CU), [values(6, 3)]),
-    "unpool": (lambda x: ops.unpool(x, ROWS, CU, 6), [values(3, 3)]),
-    "sparse_conv": (
-        lambda x, w, b: ops.sparse_conv(x, w, b, STAGE.voxels, STAGE.kernel_maps[3]),
-        [values(6, 2), values(3, 3, 3, 3, 2), values(3)],
-    ),
-    "patch_attention": (
-        lambda q, k, v: ops.patch_attention(q, k, v, TABLE),
-        [values(6, 2, 4), values(5, 2, 4, seed=1), values(5, 2, 4, seed=2)],
-    ),
-}
-EVERY_OP = pytest.mark.parametrize(("function", "inputs"), CALLS.values(), ids=CALLS)
+    clouds = (x.to(device) for x in (values(6, 3), torch.tensor([0, 6]), zero, zero, origin))
+    stage = ops.build_pyramid(*clouds, ops.PyramidSpec(0.4, 0, (), (), (4,), ((3,),))).stages[0]
+    made = {
+        "pool_max": (lambda x: ops.pool_max(x, rows, cu), [values(6, 3)]),
+        "pool_mean": (lambda x: ops.pool_mean(x, rows, cu), [values(6, 3)]),
+        "unpool": (lambda x: ops.unpool(x, rows, cu, 6), [values(3, 3)]),
+        "sparse_conv": (
+            lambda x, w, b: ops.sparse_conv(x, w, b, stage.voxels, stage.kernel_maps[3]),
+            [values(6, 2), values(3, 3, 3, 3, 2), values(3)],
+        ),
+        "patch_attention": (
+            lambda q, k, v: ops.patch_attention(q, k, v, table),
+            [values(6, 2, 4), values(5, 2, 4, seed=1), values(5, 2, 4, seed=2)],
+        ),
+    }
+    return {op: (function, [x.to(device) for x in inputs]) for op, (function, inputs) in made.items()}
 
 
 def leaves(inputs):
@@ -43,13 +49,16 @@ def leaves(inputs):
 
 
 @EVERY_OP
-def test_second_derivatives_and_forward_mode_against_finite_differences(function, inputs):
+def test_second_derivatives_and_forward_mode_against_finite_differences(op, device):
+    function, inputs = calls(device)[op]
     assert gradcheck(function, leaves(inputs), check_forward_ad=True, check_batched_grad=True)
     assert gradgradcheck(function, leaves(inputs))
 
 
 @EVERY_OP
-def test_third_derivatives_against_finite_differences(function, inputs):
+def test_third_derivatives_against_finite_differences(op, device):
+    function, inputs = calls(device)[op]
+
     def gradient(*xs):
         return torch.autograd.grad(function(*xs).pow(3).sum(), xs, create_graph=True)
 
@@ -57,7 +66,9 @@ def test_third_derivatives_against_finite_differences(function, inputs):
 
 
 @EVERY_OP
-def test_transforms_equal_autograd(function, inputs):
+def test_transforms_equal_autograd(op, device):
+    function, inputs = calls(device)[op]
+
     def loss(*xs):
         return function(*xs).pow(2).sum()
 
@@ -71,7 +82,7 @@ def test_transforms_equal_autograd(function, inputs):
     torch.testing.assert_close(value, loss(*inputs))
     torch.testing.assert_close(moved, sum((g * d).sum() for g, d in zip(ours, directions, strict=True)))
     _, pull = torch.func.vjp(loss, *inputs)
-    for got, expected in zip(pull(torch.ones((), dtype=torch.float64)), ours, strict=True):
+    for got, expected in zip(pull(torch.ones_like(value)), ours, strict=True):
         torch.testing.assert_close(got, expected)
     with forward_ad.dual_level():
         duals = [forward_ad.make_dual(x, d) for x, d in zip(inputs, directions, strict=True)]
@@ -80,7 +91,8 @@ def test_transforms_equal_autograd(function, inputs):
 
 @EVERY_OP
 @pytest.mark.parametrize("of_all", [True, False], ids=["all batched", "first batched"])
-def test_vmap_equals_a_loop(function, inputs, of_all):
+def test_vmap_equals_a_loop(op, device, of_all):
+    function, inputs = calls(device)[op]
     batch = [torch.stack([x, torch.sin(5 * x), x + 1]) for x in inputs]
     dims = tuple(0 if of_all or i == 0 else None for i in range(len(inputs)))
     arguments = [b if dim == 0 else x for b, x, dim in zip(batch, inputs, dims, strict=True)]
@@ -96,7 +108,9 @@ def test_vmap_equals_a_loop(function, inputs, of_all):
 
 
 @EVERY_OP
-def test_hessian_by_reverse_over_reverse(function, inputs):
+def test_hessian_by_reverse_over_reverse(op, device):
+    function, inputs = calls(device)[op]
+
     def loss(x):
         return function(x, *inputs[1:]).pow(2).sum()
 
@@ -107,7 +121,9 @@ def test_hessian_by_reverse_over_reverse(function, inputs):
 
 @EVERY_OP
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
-def test_transforms_under_autocast(function, inputs, dtype):
+def test_transforms_under_autocast(op, dtype):
+    function, inputs = calls(CPU)[op]
+
     def loss(*xs):
         return function(*xs).float().pow(2).sum()
 
@@ -128,7 +144,7 @@ def test_transforms_under_autocast(function, inputs, dtype):
 
 
 def test_second_derivatives_of_attention_under_autocast_are_computed_in_float32():
-    function, inputs = CALLS["patch_attention"]
+    function, inputs = calls(CPU)["patch_attention"]
 
     def second():
         xs = leaves([x.float() for x in inputs])
