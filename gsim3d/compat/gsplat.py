@@ -160,9 +160,7 @@ def rasterization(
         means.flatten(0, -2), *shapes, cameras, opacities=flat_opacities, n_clouds=n_batches, check=False, **options
     )
     values = _colors(colors, sh_degree, means, viewmats) if with_color else means.new_zeros(n_images * n, 0)
-    alphas = flat_opacities
-    if n_cameras != 1:
-        alphas = opacities[..., None, :].expand(*batch, n_cameras, n).reshape(-1)
+    alphas = flat_opacities if n_cameras == 1 else opacities[..., None, :].expand(*batch, n_cameras, n).reshape(-1)
     alphas = alphas * projection.compensations if antialiased else alphas
     rows, cu_pairs = (*projection[:4], alphas, values), projection.cu_pairs
     meta = Meta(batch_ids=None, camera_ids=None, gaussian_ids=None)
@@ -174,8 +172,8 @@ def rasterization(
     means2d, conics, depths, radii, alphas, values = rows
     known = {"radii": radii, "means2d": means2d, "depths": depths, "conics": conics, "opacities": alphas}
     meta |= {name: row.reshape(*sizes, *row.shape[1:]) for name, row in known.items()}
-    meta |= {"width": width, "height": height, "tile_size": 16 if tile_size is None else tile_size}
-    meta |= {"n_batches": n_batches, "n_cameras": n_cameras}
+    meta |= {"width": width, "height": height, "n_batches": n_batches, "n_cameras": n_cameras}
+    meta["tile_size"] = 16 if tile_size is None else tile_size
     # The 2D means as they are in meta are what is blended, so that they get a gradient.
     means2d = meta["means2d"]
     backgrounds = backgrounds.flatten(0, -2) if with_color and backgrounds is not None else None
@@ -185,8 +183,7 @@ def rasterization(
         width=width, height=height, cu_pairs=cu_pairs, background=backgrounds, absolute=absolute,
         check=False,
     )  # fmt: skip
-    color, alpha = _images(image, render_mode if with_depth else "RGB", (*batch, n_cameras))
-    return color, alpha, meta
+    return *_images(image, render_mode if with_depth else "RGB", (*batch, n_cameras)), meta
 
 
 def _refuse(offered: dict[str, Any], choices: dict[str, tuple[str, Sequence[str]]]) -> None:
@@ -227,8 +224,7 @@ def _lens(lens: str, radial: Tensor | None, tangential: Tensor | None, n_images:
     if radial is None and tangential is None:
         return lens, None
     if lens == "orthographic" or (lens == "fisheye" and tangential is not None):
-        known = "radial_coeffs are of camera_model pinhole and fisheye, tangential_coeffs of pinhole"
-        raise InputError(f"rasterization: {known}")
+        raise InputError(f"{OP}: radial_coeffs are of camera_model pinhole and fisheye, tangential_coeffs of pinhole")
     if lens == "fisheye":
         return lens, radial.reshape(n_images, 4)
     zeros = (radial if tangential is None else tangential).new_zeros(n_images, 6)

@@ -154,9 +154,7 @@ def project_gaussians(
         *(image_cloud, cu_rows, cu_pairs, n_pairs, cameras.width, cameras.height),
         *(near_plane, far_plane, radius_clip, dilation, LENSES[lens], jacobian == "clamped", antialiased),
     )
-    made = within_memory(OP, f"n_pairs={n_pairs}", call, OP, *args)
-    means2d, conics, depths, radii, compensations = made
-    return Projection(means2d, conics, depths, radii, compensations, cu_pairs)
+    return Projection._make((*within_memory(OP, f"n_pairs={n_pairs}", call, OP, *args), cu_pairs))
 
 
 def _lists(n_clouds: int, n_images: int, n: int, *, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
@@ -278,8 +276,7 @@ def _gradients(*inputs):  # of four outputs, then the radii
 def _setup(ctx, inputs, output):
     ctx.set_materialize_grads(False)
     ctx.mark_non_differentiable(output[3])
-    means, quats, scales, covars, _, viewmats, Ks, distortion, _, image_cloud, cu_rows, cu_pairs = inputs[:12]
-    lists = image_cloud, cu_rows, cu_pairs
+    means, quats, scales, covars, _, viewmats, Ks, distortion, _, *lists = inputs[:12]
     ctx.save_for_backward(output[3], means, quats, scales, covars, viewmats, Ks, distortion, *lists)
     n_pairs, width, height, _, _, _, dilation, lens, clamped, _ = inputs[12:]
     ctx.options = (n_pairs, width, height, dilation, lens, clamped)

@@ -93,8 +93,7 @@ def rasterize_projected(
         *(constant(torch.arange, n_images, device=device), cu_pairs, width, height, CUTOFFS[cutoff]),
         *sizes_of_state(means2d, n_images, n_images, width, height),
     )
-    out = within_memory(OP, f"width={width}, height={height}", call, OP, *args)
-    color, alpha, depth, features = out[:4]
+    color, alpha, depth, features, *_ = within_memory(OP, f"width={width}, height={height}", call, OP, *args)
     if n_channels > 3:
         behind = (1 - alpha)[..., None] * background[:, None, None, 3:]
         color = torch.cat([color, features + behind], -1)
@@ -128,8 +127,7 @@ def _check(rows: dict[str, Tensor], optional: dict[str, Tensor], cutoff: str) ->
 
 
 def _images(means2d, conics, depths, opacities, color, features, background, absolute, image_cloud, cu_rows, *rest):
-    width, height, _, *sizes = rest
-    n_images = background.shape[0]
+    (width, height, _, *sizes), n_images = rest, background.shape[0]
     state = state_bytes(means2d, n_images, n_images, width, height, sizes[0], sizes[2])
     return tuple(empty_images(means2d, n_images, width, height, features.shape[1], state))
 
