@@ -11,7 +11,7 @@ sizes = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(sizes)
 # What is still above its limit may shrink and not grow.
 TODAY = {
-    "lines of the package": 46_050,
+    "lines of the package": 46_000,
     "lines of the library without io": 15_847,
     "lines of readers, writers and the viewer": 4_497,
 }

@@ -14,7 +14,7 @@ set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 PYTHON="${PYTHON:-python3}"
 STATE=build/gpu_check
-OPS=(curve sparse_conv patch_attn pool row_norm plane_sweep raster decode background springs)
+OPS=(curve sparse_conv patch_attn pool row_norm plane_sweep raster decode background springs projection)
 # Tests whose checks take longest come first, longest first, in so many parts: racecheck of all of them, then memcheck.
 LONG=(raster:3:1 sparse_conv:6:2 raster_edges:4:2 pyramid:3:2 joint_attention:2:1 unchecked_lists:4:2
   pyramid_capacity:2:2 patch_attn_cuda:2:1 patch_attn:2:1 background:1:1 plane_sweep:2:1)
