@@ -2,12 +2,13 @@
 
 import importlib.util
 import inspect
+import math
 
 import pytest
 import torch
 
 from gsim3d.compat.gsplat import rasterization
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, NumericalError
 from gsim3d.ops import rasterize_gaussians
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.compat.gsplat_scene import SIZE, expected_batches, expected_images, harmonic_colors, scene_of
@@ -324,6 +325,24 @@ def test_wrong_shapes_are_named():
         rasterization(**arguments | {"colors": torch.zeros(40, 4, 3).double()}, **SIZE, sh_degree=1.0)
     with pytest.raises(ValueError, match="sh_degree=5"):
         rasterization(**arguments | {"colors": torch.zeros(40, 36, 3).double()}, **SIZE, sh_degree=5)
+
+
+@pytest.mark.parametrize("batch", [(), (2,)])
+def test_bad_numbers_are_named_on_a_cpu(batch):
+    arguments = scene_of(batch)
+    bad = {"means": math.nan, "quats": math.inf, "scales": -1.0, "opacities": 1.5, "colors": math.nan}
+    for name, value in bad.items():
+        wrong = arguments[name].clone()
+        wrong.view(-1)[7] = value
+        with pytest.raises(NumericalError, match=f"rasterization: {name} must be finite"):
+            rasterization(**arguments | {name: wrong}, **SIZE)
+    backgrounds = torch.full((*batch, 2, 3), math.inf).double()
+    with pytest.raises(NumericalError, match="rasterization: backgrounds must be finite"):
+        rasterization(**arguments, **SIZE, backgrounds=backgrounds)
+    with pytest.raises(ValueError, match="rasterization: colors must be float64, as means, or of 16 bits"):
+        rasterization(**arguments | {"colors": arguments["colors"].float()}, **SIZE)
+    with pytest.raises(ValueError, match="width and height must be positive"):
+        rasterization(**arguments, width=0, height=4)
 
 
 # ---- gsplat 1.5.3, where it is installed -----------------------------------------------------------------------------
