@@ -86,10 +86,10 @@ def test_what_passed_is_not_repeated_whatever_was_measured(tree):
 
 def test_what_failed_is_named_and_repeated(tree):
     status, last, _ = check(tree, "bench", FAILS="bench/pool.py")
-    assert status == 1 and last == "gpu_check bench: 15 passed; failed: bench_pool; not run: none"
+    assert status == 1 and last == "gpu_check bench: 16 passed; failed: bench_pool; not run: none"
     status, last, calls = check(tree, "bench")
     assert (status, calls) == (0, " tools/bench/pool.py --device cuda --seconds 0.5\n")
-    assert "16 passed; failed: none" in last
+    assert "17 passed; failed: none" in last
 
 
 def test_nothing_runs_without_a_build(tree):
