@@ -86,6 +86,8 @@ def render(program, folder):
         b"element vertex": b"comment antialiased 1\nelement vertex",
     }
     bad = [good.replace(part, other) for part, other in wrong.items()]
+    (folder / "in.ply").write_bytes(good.replace(b"element vertex", b"comment antialiased 0\nelement vertex"))
+    run(program, folder / "in.ply", folder / "out.png")
     for data in (b"ply\nelement vertex 3\nend_header\n", *bad):
         (folder / "bad.ply").write_bytes(data)
         assert subprocess.run([program, folder / "bad.ply", folder / "none.png"], capture_output=True).returncode == 1

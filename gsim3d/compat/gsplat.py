@@ -35,7 +35,7 @@ class Meta(dict):
     def __missing__(self, key: str) -> Any:
         if key in NO_TILES:
             advice = "the kernel makes tiles in a form of its own; read radii, means2d, conics and depths"
-            raise InputError(f"rasterization: meta[{key!r}] is not kept: {advice}")
+            raise InputError(f"{OP}: meta[{key!r}] is not kept: {advice}")
         raise KeyError(key)
 
 
@@ -142,6 +142,7 @@ def rasterization(
     optional = {"quats": quats, "scales": scales} if covars is None else {"covars": covars}
     optional |= {"radial_coeffs": radial_coeffs, "tangential_coeffs": tangential_coeffs}
     optional |= {"colors": colors, "backgrounds": backgrounds} if with_color else {}
+    check_whole(OP, width=width, height=height)
     _check(camera_model, means, viewmats, Ks, opacities, optional)
     batch, n, n_cameras = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
     viewmats, Ks = viewmats.to(means.dtype), Ks.to(means.dtype)
@@ -189,17 +190,17 @@ def rasterization(
 def _refuse(offered: dict[str, Any], choices: dict[str, tuple[str, Sequence[str]]]) -> None:
     for name, value in offered.items():
         if value is not None and value is not False:
-            raise InputError(f"rasterization: {name} is not offered; leave it at its default")
+            raise InputError(f"{OP}: {name} is not offered; leave it at its default")
     for name, (value, known) in choices.items():
-        check_one_of(f"rasterization: {name}", value, known)
+        check_one_of(f"{OP}: {name}", value, known)
 
 
 def _check(camera_model: str, means, viewmats, Ks, opacities, optional: dict[str, Tensor | None]) -> None:
     tensors = {"means": means, "viewmats": viewmats, "Ks": Ks, "opacities": opacities}
     given = {name: value for name, value in optional.items() if value is not None}
-    check_tensors("rasterization", **tensors, **given)
+    check_tensors(OP, **tensors, **given)
     if means.dim() < 2 or viewmats.dim() < 3 or any(value.dim() == 0 for value in given.values()):
-        raise ValueError("rasterization: means must be [..., N, 3], viewmats [..., C, 4, 4]: too few dimensions")
+        raise ValueError(f"{OP}: means must be [..., N, 3], viewmats [..., C, 4, 4]: too few dimensions")
     batch, n, n_cameras = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
     shapes = {"means": (n, 3), "opacities": (n,), "viewmats": (n_cameras, 4, 4), "Ks": (n_cameras, 3, 3)}
     shapes |= {"covars": (n, 3, 3)} if "covars" in optional else {"quats": (n, 4), "scales": (n, 3)}
@@ -212,7 +213,7 @@ def _check(camera_model: str, means, viewmats, Ks, opacities, optional: dict[str
         value = tensors[name]
         if value is None or value.shape != (*batch, *shape):
             got = None if value is None else list(value.shape)
-            raise ValueError(f"rasterization: {name} must be {[*batch, *shape]}; got {got}")
+            raise ValueError(f"{OP}: {name} must be {[*batch, *shape]}; got {got}")
     check_floating(OP, {name: given.get(name) for name in ("colors", "backgrounds")}, means=means)
     check_numbers(OP, largest_of=LARGEST, means=means, **given)
     check_numbers(OP, negative=False, scales=given.get("scales"))
@@ -237,20 +238,20 @@ def _colors(colors: Tensor | None, sh_degree: int | None, means: Tensor, viewmat
     """Colours of pairs, [I N, D]."""
     batch, n, n_cameras = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
     if colors is None:
-        raise ValueError("rasterization: colors are needed, unless render_mode is D or ED")
+        raise ValueError(f"{OP}: colors are needed, unless render_mode is D or ED")
     if sh_degree is None:
         of_images = colors.shape[:-1] == (*batch, n_cameras, n)
         if not of_images and colors.shape[:-1] != (*batch, n):
             wanted = f"{[*batch, n, 'D']} or {[*batch, n_cameras, n, 'D']}"
-            raise ValueError(f"rasterization: colors must be {wanted}; got {list(colors.shape)}")
+            raise ValueError(f"{OP}: colors must be {wanted}; got {list(colors.shape)}")
         if not of_images and n_cameras != 1:
             colors = colors[..., None, :, :].expand(*batch, n_cameras, n, colors.shape[-1])
         return colors.flatten(0, -2)
-    check_whole("rasterization", sh_degree=sh_degree)
+    check_whole(OP, sh_degree=sh_degree)
     shared, n_terms = colors.dim() == 3, (sh_degree + 1) ** 2
     if colors.shape[:-2] not in ((n,), (*batch, n)) or not 0 <= sh_degree <= 4 or colors.shape[-2] < n_terms:
         wanted = f"with sh_degree={sh_degree} (0 to 4) colors must be [N={n}, K >= {n_terms}, D]"
-        raise ValueError(f"rasterization: {wanted}; got {list(colors.shape)}")
+        raise ValueError(f"{OP}: {wanted}; got {list(colors.shape)}")
     sh = colors[..., :n_terms, :]
     turned, moved = viewmats[..., :3, :3], viewmats[..., :3, 3]
     centre = -(turned.mT @ moved[..., None])[..., 0]

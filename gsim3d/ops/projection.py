@@ -283,8 +283,7 @@ def _setup(ctx, inputs, output):
 
 
 def _backward(ctx, means2d, conics, depths, _, compensations):
-    saved = ctx.saved_tensors
-    of_viewmats, of_Ks, of_distortion = ctx.needs_input_grad[5:8]
+    saved, (of_viewmats, of_Ks, of_distortion) = ctx.saved_tensors, ctx.needs_input_grad[5:8]
     options = *ctx.options, of_viewmats, of_Ks or of_distortion
     grads = call("project_gaussians_backward", means2d, conics, depths, compensations, *saved, *options)
     wanted = (True, *(x is not None for x in saved[2:5]), of_viewmats, of_Ks, of_distortion)

@@ -116,6 +116,7 @@ class StepContext:
         self.runs = history.clouds.row_runs(self.newest)
         self.changes, self.awake, self.n_views = changes, None, None
         self._most_movable, self._share, self._shared = most_movable, share, {}
+        # Without self in it: a cycle would keep the autograd graph until the next garbage collection.
         self._make_state = state if state is not None else lambda newest=self.newest: history.select_clouds(newest)
 
     @property

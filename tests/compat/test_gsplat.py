@@ -343,6 +343,9 @@ def test_bad_numbers_are_named_on_a_cpu(batch):
         rasterization(**arguments | {"colors": arguments["colors"].float()}, **SIZE)
     with pytest.raises(ValueError, match="width and height must be positive"):
         rasterization(**arguments, width=0, height=4)
+    for wrong in (45.5, True, 2**70):
+        with pytest.raises((TypeError, ValueError), match="rasterization: width must"):
+            rasterization(**arguments, width=wrong, height=4)
 
 
 # ---- gsplat 1.5.3, where it is installed -----------------------------------------------------------------------------
