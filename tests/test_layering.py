@@ -105,6 +105,27 @@ def test_imports_flow_one_way():
     assert not wrong, "\n".join(wrong)
 
 
+def imported_files(path: Path, files: dict[str, Path]) -> set[str]:
+    """Modules that ``path`` imports when it runs: everywhere but under TYPE_CHECKING."""
+    found, left = set(), [ast.parse(path.read_text())]
+    while left:
+        node = left.pop()
+        if isinstance(node, ast.ImportFrom):
+            names = [f"{node.module}.{alias.name}".removeprefix("gsim3d.") for alias in node.names]
+            found |= {name if name in files else name.rpartition(".")[0] for name in names}
+        elif not (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)):
+            left += ast.iter_child_nodes(node)
+    return found & set(files)
+
+
+def test_no_file_imports_itself():
+    files = {module_of(path): path for path in python_files()}
+    imports = {name: imported_files(path, files) - {name} for name, path in files.items()}
+    while ends := {name for name, others in imports.items() if not others}:  # what is left at last is in circles
+        imports = {name: others - ends for name, others in imports.items() if name not in ends}
+    assert not imports
+
+
 def test_the_top_level_is_small():
     modules = list((ROOT / "gsim3d").glob("*.py"))
     assert len(modules) <= MOST_AT_THE_TOP, sorted(path.name for path in modules)

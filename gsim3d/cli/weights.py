@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    from gsim3d.evaluate.perceptual.weights import install
+    from gsim3d.evaluate.perceptual.install import install
 
     install(args.metric, args.files)
     return 0

@@ -15,6 +15,7 @@ from gsim3d.cameras import Cameras, Frames, InputSpec
 from gsim3d.data import layouts
 from gsim3d.data.cameras import check_directions, frusta_origin, near_zero, shared_view, spread_steps
 from gsim3d.data.fitting import Fitting, fit, own_depths, resample
+from gsim3d.data.frames import make_frames
 from gsim3d.data.images import ImageCache
 from gsim3d.data.lenses import Undistorter
 from gsim3d.data.masks import background_image, foreground
@@ -226,8 +227,6 @@ class Scene:
         Raises:
             InputError: the scene has too few steps or cameras.
         """
-        from gsim3d.data.dataset import make_frames
-
         if not 0 <= start <= self.n_steps - inputs.history:
             raise InputError(
                 f"{self.path}: needs {inputs.history} steps from step {start}, but the scene has {self.n_steps} steps"

