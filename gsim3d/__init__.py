@@ -6,6 +6,7 @@ kernels on numpy arrays) works without torch.
 """
 
 import importlib
+import sys
 from typing import TYPE_CHECKING, Any
 
 from gsim3d.errors import check_processor
@@ -56,7 +57,7 @@ if TYPE_CHECKING:  # the same names for type checkers; tests/test_types.py compa
 def __getattr__(name: str) -> Any:
     if name in _MODULE_OF:
         return getattr(importlib.import_module(_MODULE_OF[name]), name)
-    raise AttributeError(f"module 'gsim3d' has no attribute {name!r}")
+    raise AttributeError(f"module 'gsim3d' has no attribute {name!r}", name=name, obj=sys.modules[__name__])
 
 
 def __dir__() -> list[str]:

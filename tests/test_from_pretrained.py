@@ -10,7 +10,7 @@ from gsim3d import presets
 from gsim3d.cameras import InputSpec
 from gsim3d.compat import load_released
 from gsim3d.compat.released_model import ReleasedModelConfig, ReleasedSimulator
-from gsim3d.data import Scene
+from gsim3d.data import Fitting, Scene
 from gsim3d.effects.edits import Edit, Remove
 from gsim3d.effects.spec import DynamicsEffects, EffectsSpec
 from gsim3d.errors import InputError
@@ -101,14 +101,21 @@ def test_speed_is_read_beside_the_weights(folder):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"steps": 0}, "steps must be at least 1; got 0"),
-        ({"inputs": dataclasses.replace(INPUTS, image_size=(32, 48))}, "images must be 32x48 pixels"),
+        ({"steps": 0}, "steps must be an integer of at least 1; got 0"),
+        ({"steps": 1.5}, "steps must be an integer of at least 1; got 1.5"),
+        ({"source": "data/ball/0000"}, r"source must be a scene \(gsim3d.data.Scene.open.*got str"),
+        ({"cameras": [0]}, r"cameras must be Cameras.*got \[0\]"),
+        (
+            {"inputs": dataclasses.replace(INPUTS, image_size=(32, 48))},
+            r"images must be 32x48 pixels.*Fitting\(size=\(32, 48\)\)",
+        ),
     ],
 )
 def test_predictions_that_are_refused(simulator, change, message):
     simulator.inputs = change.get("inputs", INPUTS)
     with pytest.raises(InputError, match=message):
-        simulator.predict(make_frames((2,)), change.get("steps", 1))
+        source = change.get("source", make_frames((2,)))
+        simulator.predict(source, change.get("steps", 1), cameras=change.get("cameras"))
 
 
 def test_checkpoints_that_are_refused(folder):
@@ -162,3 +169,17 @@ def test_scene_is_a_source_of_frames(tmp_path):
     assert torch.equal(scene.input_frames(kept).cameras.viewmats[:2], scene.cameras_at([0, 3], [0]).viewmats)
     with pytest.raises(InputError, match="needs 2 steps from step 3, but the scene has 4 steps"):
         scene.input_frames(simulator.inputs, start=3)
+
+
+def test_frames_of_a_scene_are_fitted_as_the_command_fits_them(tmp_path):
+    scene = Scene.open(write_scene(tmp_path / "scene", 4))
+    inputs = InputSpec(image_size=(scene.width, scene.height), fps=scene.fps)
+    for factor, changes in ((1.2, True), (1.3, False)):
+        depths = (scene.near * factor, scene.far)
+        frames = scene.input_frames(dataclasses.replace(inputs, near_far=depths))
+        assert frames.cameras.near[0] == pytest.approx(depths[0] if changes else scene.near)
+    kept = Scene.open(scene.path, fitting=Fitting(near_far=(0.5, 9.0)))
+    assert kept.input_frames(dataclasses.replace(inputs, near_far=(0.6, 9.0))).cameras.near[0] == 0.5
+    for rate, remedy in ((scene.fps / 2, "takes every frame number 2"), (scene.fps * 0.7, "resample the scene")):
+        with pytest.raises(InputError, match=f"{scene.fps:g} frames per second.*trained at.*{remedy}"):
+            scene.input_frames(dataclasses.replace(inputs, fps=rate))

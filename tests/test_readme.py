@@ -95,7 +95,7 @@ def run(arguments: list[str], folder: Path) -> subprocess.CompletedProcess:
 @pytest.mark.parametrize("snippet", blocks("python"), ids=["predict", "rasterize"])
 def test_python_snippet_prints_what_it_says(snippet, folder):
     assert len([line for line in snippet.splitlines() if line.strip()]) <= 12
-    done = run(["-c", snippet], folder)
+    done = run(["-W", "error::UserWarning", "-c", snippet], folder)
     assert done.returncode == 0, done.stderr
     expected = re.findall(r"# prints: (.*)", snippet)
     assert expected and done.stdout.splitlines() == expected

@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from gsim3d.data.cameras import depth_range, spread_steps
 from gsim3d.data.recording import BACKGROUND, FIXED, MOVING, ReadImages, Recording
 from gsim3d.errors import InputError
 
+SIMILAR = 1.25  # scenes whose near and far differ by at most this factor use those of a training
 MIN_EXTENT = 1e-3  # metres; scenes with smaller camera coordinates are not normalised
 RATE_TOLERANCE = 1.0001e-3  # relative; 29.97 and 30 fps count as equal
 
@@ -21,6 +23,22 @@ def frame_stride(rate: float, wanted: float) -> int | None:
     """Returns the integer ``rate / wanted``; None if ``rate`` is not an integer multiple of ``wanted``."""
     stride = max(1, round(rate / wanted))
     return stride if math.isclose(rate, stride * wanted, rel_tol=RATE_TOLERANCE) else None
+
+
+def check_rate(scene: Any, fps: float | None) -> None:
+    """Raises InputError if the frame rate of ``scene`` is not ``fps`` (None: unknown); names both, and a remedy."""
+    if fps is None or scene.n_steps == 1 or (stride := frame_stride(scene.fps, fps)) == 1:
+        return
+    how = f"--resample, or Scene.open(folder, fps={fps:g}), takes every frame number {stride}"
+    raise InputError(
+        f"{scene.path}: {scene.fps:g} frames per second; the model was trained at {fps:g} "
+        f"({how if stride else 'not an integer multiple: resample the scene'})"
+    )
+
+
+def similar(depths: tuple[float, float], others: tuple[float, float], factor: float = SIMILAR) -> bool:
+    """Whether two (near, far) differ by at most ``factor``."""
+    return all(max(a / b, b / a) <= factor for a, b in zip(depths, others, strict=True))
 
 
 def resample(recording: Recording, fps: float) -> Recording:
@@ -72,9 +90,8 @@ def fit(recording: Recording, fitting: Fitting) -> Recording:
     if fitting.size is not None and any(size != fitting.size for size in recording.sizes):
         recording = _of_size(recording, fitting.size, fitting)
     if fitting.near_far is not None:
-        near, far = fitting.near_far
-        own = own_depths(recording)
-        if own is None or max(near / own[0], own[0] / near, far / own[1], own[1] / far) <= fitting.slack:
+        own, (near, far) = own_depths(recording), fitting.near_far
+        if own is None or similar(own, fitting.near_far, fitting.slack):
             recording = dataclasses.replace(recording, near=near, far=far)
     return recording
 

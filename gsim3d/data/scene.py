@@ -14,7 +14,7 @@ from torch import Tensor
 from gsim3d.cameras import Cameras, Frames, InputSpec
 from gsim3d.data import layouts
 from gsim3d.data.cameras import check_directions, frusta_origin, near_zero, shared_view, spread_steps
-from gsim3d.data.fitting import Fitting, fit, own_depths, resample
+from gsim3d.data.fitting import Fitting, check_rate, fit, own_depths, resample, similar
 from gsim3d.data.frames import make_frames
 from gsim3d.data.images import ImageCache
 from gsim3d.data.lenses import Undistorter
@@ -219,13 +219,16 @@ class Scene:
     def input_frames(self, inputs: InputSpec, *, start: int = 0, cams: Sequence[int] | None = None) -> Frames:
         """Returns input frames for a simulator (:class:`gsim3d.cameras.FrameSource`).
 
+        A scene that was opened as recorded gets the depth range of the training if its own differs by at most a factor
+        of 1.25, as `gsim3d simulate` does.
+
         Args:
             inputs: input specification of the simulator.
             start: first step.
             cams: camera indices. Default: the number used in training, evenly spaced over the cameras allowed as input.
 
         Raises:
-            InputError: the scene has too few steps or cameras.
+            InputError: the scene has too few steps or cameras, or another frame rate than the training.
         """
         if not 0 <= start <= self.n_steps - inputs.history:
             raise InputError(
@@ -237,7 +240,13 @@ class Scene:
             allowed = [cam for cam in (known and inputs.context_cameras) or range(self.n_cams) if cam not in excluded]
             n = min(inputs.context_views, len(allowed))
             cams = sorted(allowed[k * len(allowed) // n] for k in range(n))
-        return make_frames([self], [list(cams)], [range(start, start + inputs.history)])
+        check_rate(self, inputs.fps)
+        frames = make_frames([self], [list(cams)], [range(start, start + inputs.history)])
+        as_recorded = self.fitting.near_far is None and not self.fitting.enlarge
+        if not (inputs.near_far and as_recorded and similar((self.near, self.far), inputs.near_far)):
+            return frames
+        near, far = (torch.full_like(frames.cameras.near, depth) for depth in inputs.near_far)
+        return dataclasses.replace(frames, cameras=dataclasses.replace(frames.cameras, near=near, far=far))
 
     def _numbers(self, cams, steps) -> tuple[list[int], list[int]]:
         cams, steps = [int(c) for c in cams], [int(s) for s in steps]

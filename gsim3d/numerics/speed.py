@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from gsim3d.effects.edits import Edit
 from gsim3d.effects.plan import Plan
 from gsim3d.effects.spec import EffectsSpec, Sleep
 from gsim3d.errors import InputError, check_one_of, check_ranges
+from gsim3d.io.files import shown
 from gsim3d.io.settings import from_dict
 from gsim3d.numerics.trust import MOST_LEFT_OUT, check_input, read_checkpoints, without_oldest
 from gsim3d.ops.raster import CUTOFFS, Rendering
@@ -150,11 +152,17 @@ def encode_histories(
     """Encodes frames, also without their 1 to ``left_out`` oldest steps, and warns as :func:`check_input` does, with
     ``names`` of the scenes. Raises InputError if the image size is wrong."""
     inputs = InputSpec() if simulator.inputs is None else simulator.inputs
+    if not isinstance(source, Frames) and not hasattr(source, "input_frames"):
+        wanted = "a scene (gsim3d.data.Scene.open(folder)), Frames or Particles"
+        raise InputError(f"predict: source must be {wanted}; got {type(source).__name__}")
     frames = source if isinstance(source, Frames) else source.input_frames(inputs)
     size = (frames.cameras.width, frames.cameras.height)
     if inputs.image_size and size != tuple(inputs.image_size):
         wanted = "x".join(map(str, inputs.image_size))
-        raise InputError(f"predict: images must be {wanted} pixels, as in training; got {size[0]}x{size[1]}")
+        fitted = f"Scene.open(folder, fitting=Fitting(size=({', '.join(map(str, inputs.image_size))})))"
+        raise InputError(
+            f"predict: images must be {wanted} pixels, as in training; got {size[0]}x{size[1]}; {fitted} scales them"
+        )
     setting, device = simulator.setting, next(simulator.parameters()).device
     frames, states = frames.to(device), []
     with setting.precision("encoder", device.type):
@@ -176,8 +184,12 @@ def predict(
     **options: Any,
 ) -> Prediction:
     """:meth:`gsim3d.Simulator.predict` under the simulator's setting; ``options`` go to the rollout."""
-    if steps < 1:
-        raise InputError(f"predict: steps must be at least 1; got {steps}")
+    if not isinstance(steps, Integral) or steps < 1:
+        raise InputError(f"predict: steps must be an integer of at least 1; got {steps!r}")
+    if not isinstance(cameras, Cameras | None):
+        raise InputError(
+            f"predict: cameras must be Cameras, such as scene.cameras_at([0, 3], [0]); got {shown(cameras)}"
+        )
     state = source if isinstance(source, Particles) else encode(simulator, source)
     setting, device = simulator.setting, state.means.device
     with setting.precision("dynamics", device.type):

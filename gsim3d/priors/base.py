@@ -14,7 +14,7 @@ from gsim3d.errors import InputError, check_ranges
 from gsim3d.nn.layers import RowLinear
 from gsim3d.nn.point_transformer import STEM_KERNEL, SparseConv
 from gsim3d.priors.movable import Movable, Windows
-from gsim3d.state import Particles, newest_clouds, take_runs, with_attribute
+from gsim3d.state import ATTRIBUTES, Particles, newest_clouds, take_runs, with_attribute
 
 MAX_GAIN = 2.0  # gains are bounded to [-MAX_GAIN, MAX_GAIN]
 
@@ -40,6 +40,9 @@ class PriorConfig:
 
     def __init_subclass__(cls, **kwargs):
         super().__init_subclass__(**kwargs)
+        known = PriorConfig.VARIANTS.get(cls.type, cls)
+        if not cls.type or known.__qualname__ != cls.__qualname__:  # a notebook may define one again
+            raise InputError(f"{cls.__name__}: needs a type that no other prior has; got {cls.type!r}")
         PriorConfig.VARIANTS[cls.type] = cls
 
     def __post_init__(self):
@@ -193,6 +196,8 @@ class Prior(nn.Module):
 
     def __init_subclass__(cls, config: type[PriorConfig] | None = None, **kwargs):
         super().__init_subclass__(**kwargs)
+        if unknown := [name for name in cls.attributes if name not in ATTRIBUTES]:
+            raise InputError(f"{cls.__name__}: {unknown[0]!r} is no attribute of particles; add it in gsim3d/state.py")
         if config is not None:
             config.PRIOR = cls
 

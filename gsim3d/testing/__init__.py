@@ -1,1 +1,1 @@
-"""Invariances, stress tests and approximation errors of a simulator."""
+"""Invariances and stress tests of a simulator."""

@@ -13,7 +13,7 @@ from gsim3d import presets
 from gsim3d.compat.checkpoints import SWITCHES, current_data, current_model
 from gsim3d.compat.released_model import ReleasedModelConfig, ReleasedSimulator, simulator_class
 from gsim3d.data import Scene
-from gsim3d.data.fitting import frame_stride
+from gsim3d.data.fitting import SIMILAR, check_rate
 from gsim3d.effects.plan import Plan
 from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import FitWarning, InputError, did_you_mean, naming
@@ -25,7 +25,6 @@ from gsim3d.pretrained import KEEP, loading
 from gsim3d.simulator import Simulator
 from gsim3d.train.config import DataConfig, TrainConfig
 
-SIMILAR = 1.25  # scenes whose near and far differ by at most this factor use those of the training
 PRESETS = ("tiny", "small", "paper_latent", "paper_explicit")
 
 
@@ -130,13 +129,7 @@ class Restored:
                 f"{scene.path}: depth range {scene.near:g} to {scene.far:g}; the model was trained on "
                 f"{self.data.near_far[0]:g} to {self.data.near_far[1]:g}: open the scene with open_scene, which fits it"
             )
-        known = self.fps is not None and scene.n_steps > 1
-        if known and (stride := frame_stride(scene.fps, self.fps)) != 1:
-            how = f"--resample, or open_scene(folder, resample=True), takes every frame number {stride}"
-            remedy = how if stride else "not an integer multiple: resample the scene"
-            raise InputError(
-                f"{scene.path}: {scene.fps:g} frames per second; the model was trained at {self.fps:g} ({remedy})"
-            )
+        check_rate(scene, self.fps)
 
     def data_of(self, scene: Scene) -> DataConfig:
         """Adapts ``data`` to a scene: drops camera indices if one does not exist, and limits the number of views."""

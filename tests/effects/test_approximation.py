@@ -8,8 +8,8 @@ import torch
 from gsim3d.cameras import Cameras
 from gsim3d.effects.spec import DynamicsEffects, EffectsSpec, Sleep
 from gsim3d.errors import InputError
-from gsim3d.testing.approximation import compare_backgrounds, compare_sleep
 from tests.dynamics.scenes import TINY, make_history
+from tests.effects.approximation import compare_backgrounds, compare_sleep
 from tests.effects.resting import make_simulator
 
 pytestmark = pytest.mark.usefixtures("one_thread")

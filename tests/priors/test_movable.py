@@ -1,11 +1,13 @@
 """Movable particles: compaction, gradients, and independence of the capacity."""
 
 import dataclasses
+from dataclasses import dataclass
 
 import pytest
 import torch
 
-from gsim3d.priors import DirectionalLightConfig, GravityConfig, InertiaConfig, ShapeMatchingConfig
+from gsim3d.errors import InputError
+from gsim3d.priors import DirectionalLightConfig, GravityConfig, InertiaConfig, Prior, PriorConfig, ShapeMatchingConfig
 from gsim3d.priors.movable import Movable
 from gsim3d.state import DYNAMIC, with_attribute
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
@@ -87,3 +89,21 @@ def test_capacity_of_movable_particles_changes_nothing(device):
     for n in (most(history), 36, 40):
         for name, value in found[n].items():
             assert_close_relative_to_max(value.detach(), found[None][name].detach(), 1e-4)
+
+
+def test_priors_that_are_refused_when_they_are_defined():
+    with pytest.raises(InputError, match="MineConfig: needs a type that no other prior has; got 'gravity'"):
+
+        @dataclass(frozen=True)
+        class MineConfig(PriorConfig):
+            type: str = "gravity"
+
+    with pytest.raises(InputError, match="UnnamedConfig: needs a type that no other prior has; got ''"):
+
+        class UnnamedConfig(PriorConfig):
+            pass
+
+    with pytest.raises(InputError, match="Warm: 'temperature' is no attribute of particles"):
+
+        class Warm(Prior):
+            attributes = ("temperature",)

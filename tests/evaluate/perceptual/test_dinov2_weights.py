@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gsim3d.errors import InputError
-from gsim3d.evaluate.perceptual import install, weights
+from gsim3d.evaluate.perceptual import install
 from gsim3d.evaluate.perceptual.convert import dinov2_tensors, read_onnx
 from tests.nn.multiview_encoder.published_keys import keys_of
 
