@@ -107,7 +107,7 @@ def test_speed_is_read_beside_the_weights(folder):
         ({"cameras": [0]}, r"cameras must be Cameras.*got \[0\]"),
         (
             {"inputs": dataclasses.replace(INPUTS, image_size=(32, 48))},
-            r"images must be 32x48 pixels.*Fitting\(size=\(32, 48\)\)",
+            r"images must be 32x48 pixels.*Fitting\(\(32, 48\)\)",
         ),
     ],
 )

@@ -153,16 +153,14 @@ def encode_histories(
     ``names`` of the scenes. Raises InputError if the image size is wrong."""
     inputs = InputSpec() if simulator.inputs is None else simulator.inputs
     if not isinstance(source, Frames) and not hasattr(source, "input_frames"):
-        wanted = "a scene (gsim3d.data.Scene.open(folder)), Frames or Particles"
-        raise InputError(f"predict: source must be {wanted}; got {type(source).__name__}")
+        kinds = f"a scene (gsim3d.data.Scene.open), Frames or Particles; got {type(source).__name__}"
+        raise InputError(f"predict: source must be {kinds}")
     frames = source if isinstance(source, Frames) else source.input_frames(inputs)
     size = (frames.cameras.width, frames.cameras.height)
     if inputs.image_size and size != tuple(inputs.image_size):
-        wanted = "x".join(map(str, inputs.image_size))
-        fitted = f"Scene.open(folder, fitting=Fitting(size=({', '.join(map(str, inputs.image_size))})))"
-        raise InputError(
-            f"predict: images must be {wanted} pixels, as in training; got {size[0]}x{size[1]}; {fitted} scales them"
-        )
+        wanted, got = ("x".join(map(str, pixels)) for pixels in (inputs.image_size, size))
+        scaled = f"Scene.open(folder, fitting=Fitting({tuple(inputs.image_size)})) scales them"
+        raise InputError(f"predict: images must be {wanted} pixels, as in training; got {got}; {scaled}")
     setting, device = simulator.setting, next(simulator.parameters()).device
     frames, states = frames.to(device), []
     with setting.precision("encoder", device.type):
@@ -187,9 +185,7 @@ def predict(
     if not isinstance(steps, Integral) or steps < 1:
         raise InputError(f"predict: steps must be an integer of at least 1; got {steps!r}")
     if not isinstance(cameras, Cameras | None):
-        raise InputError(
-            f"predict: cameras must be Cameras, such as scene.cameras_at([0, 3], [0]); got {shown(cameras)}"
-        )
+        raise InputError(f"predict: cameras must be Cameras, such as scene.cameras_at([0], [0]); got {shown(cameras)}")
     state = source if isinstance(source, Particles) else encode(simulator, source)
     setting, device = simulator.setting, state.means.device
     with setting.precision("dynamics", device.type):
