@@ -148,11 +148,11 @@ class CapturedRollout:
         report: counts invalid numbers. Default: ``simulator.report``.
         cutoff: see :meth:`Simulator.render`.
 
-    Raises:
-        InputError: an argument is invalid; the message names it.
-
     Attributes:
         captures: number of captures; 1 as long as the capacity sufficed.
+
+    Raises:
+        InputError: an argument is invalid; the message names it.
     """
 
     def __init__(

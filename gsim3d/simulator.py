@@ -271,12 +271,12 @@ class Simulator(nn.Module):
         Returns:
             Particles of each step, with one cloud per scene.
 
+        Gradients:
+            through all steps, also to displacements of actors.
+
         Raises:
             InputError: an edit or actor is invalid (the message names its step and operation), or the number of
                 ``plans`` is not that of the scenes.
-
-        Gradients:
-            through all steps, also to displacements of actors.
         """
         if plans is not None:
             if actors:

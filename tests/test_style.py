@@ -137,6 +137,17 @@ def public_functions():
                     yield f"{name}: {owner}{function.name}", function
 
 
+def test_sections_of_docstrings_have_one_order():
+    order = ["Args", "Returns", "Yields", "Attributes", "Gradients", "Determinism", "Raises", "Source", "Example"]
+    wrong = []
+    for name, tree in modules():
+        for node in ast.walk(tree):
+            if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+                found = [section for section in sections(ast.get_docstring(node) or "") if section in order]
+                wrong += [f"{name}: {node.name}: {found}"] if found != sorted(found, key=order.index) else []
+    assert not wrong, "\n".join(wrong)
+
+
 def test_sections_of_docstrings_are_those_of_the_function():
     wrong = []
     for where, function in public_functions():

@@ -47,13 +47,13 @@ class Actors:
         state: initial history of the rollout.
         n_steps: steps of the rollout.
 
-    Raises:
-        InputError: displacements have a wrong shape, are too few or not finite; or particles are frozen, missing or
-            selected twice.
-
     Attributes:
         state: initial history with the attribute ``actor``, the index of each particle's actor or -1. The last
             displacement of actors equals their first one.
+
+    Raises:
+        InputError: displacements have a wrong shape, are too few or not finite; or particles are frozen, missing or
+            selected twice.
     """
 
     def __init__(self, actors: Sequence[Actor], state: Particles, n_steps: int):

@@ -71,11 +71,13 @@ def validate_particles(
             asleep; invalid values are replaced by previous ones.
         changed: attributes that may differ from ``previous``; only these are validated. None: all.
         max_opacity: largest valid opacity.
-    Raises:
-        NumericalError: particles are invalid and ``config.on_invalid`` is "raise" (on the CPU).
+
     Gradients:
         Through valid particles. On the CPU, the backward pass raises if the gradient of an invalid particle is not
         finite, unless ``report`` is closed.
+
+    Raises:
+        NumericalError: particles are invalid and ``config.on_invalid`` is "raise" (on the CPU).
     """
     fields = {name: value for name, value in particles.row_fields().items() if ATTRIBUTES[name].validated}
     if changed is not None:

@@ -39,13 +39,14 @@ class Runner:
     Args:
         restored: simulator as trained.
         setting: how to run it.
-    Raises:
-        InputError: the model does not support the setting.
 
     Attributes:
         simulator: simulator with the configuration of the setting.
         plan: its plan.
         restored: ``restored`` with both.
+
+    Raises:
+        InputError: the model does not support the setting.
     """
 
     def __init__(self, restored: Restored, setting: Setting = Setting()):

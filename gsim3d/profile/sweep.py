@@ -155,11 +155,12 @@ class BenchmarkCase:
         scenes: scenes with the same cameras.
         n_steps: predicted steps; None: to the end of the shortest video.
         metrics: scores against the video, from :func:`gsim3d.evaluate.scoring.measurable`.
-    Raises:
-        InputError: scenes do not fit the model.
 
     Attributes:
         not_measured: metric -> reason why it has no value.
+
+    Raises:
+        InputError: scenes do not fit the model.
     """
 
     def __init__(
@@ -328,12 +329,13 @@ class Stepping:
         numbers: indices of the scenes of the batch.
         span: steps a call; None: :meth:`Runner.span`.
         stopwatch: records the sections of every call; a GraphStopwatch is captured into the graph.
-    Raises:
-        CaptureError: the graph cannot be captured.
-        InputError: the model does not support the setting.
 
     Attributes:
         capture_seconds: seconds of the capture.
+
+    Raises:
+        CaptureError: the graph cannot be captured.
+        InputError: the model does not support the setting.
     """
 
     def __init__(

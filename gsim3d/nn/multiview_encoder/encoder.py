@@ -77,14 +77,17 @@ class Encoder(nn.Module):
             shapes: of :meth:`static_shapes`, for frames whose values alone differ. There is then no device
                 synchronisation and no check; pixels beyond the capacity are left out.
             check: whether to validate ``frames``; False where the caller has done so.
+
         Returns:
             One particle a pixel.
+
+        Gradients:
+            Flow to ``frames.images`` and the parameters; of convolutions as torch's own switch for them says.
+
         Raises:
             InputError: sizes do not fit the network's strides or each other; the message names the argument.
             NumericalError: an image, camera or origin is not finite or out of range; the message names scene, step and
                 tensor.
-        Gradients:
-            Flow to ``frames.images`` and the parameters; of convolutions as torch's own switch for them says.
         """
         if check and shapes is None:
             self.check(frames)
