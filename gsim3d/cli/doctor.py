@@ -1,6 +1,6 @@
 """``gsim3d doctor``: checks the installation and runs a self-test of every op.
 
-Without options: lists installed packages and compiled modules, and compares every op with plain torch.
+Without options: lists installed packages and compiled modules, and compares every op with known answers.
 
 With --stability: tests invariances of the model (to translation, rotation, reordering, repetition and splitting of
 scenes, and to a far particle) and runs stress tests on your scenes (black images, one view, NaN, coinciding particles,

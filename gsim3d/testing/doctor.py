@@ -88,11 +88,11 @@ def _ops_work(device: str) -> bool:
     from gsim3d.testing import selftest
 
     healthy = True
-    print(f"Self-test on {device} (forward and backward against plain torch)")
-    for name, check in selftest.CHECKS.items():
+    print(f"Self-test on {device} (forward and backward against known answers)")
+    for name in selftest.CHECKS:
         start = time.perf_counter()
         try:
-            error = check(device)
+            error = selftest.check(name, device)
             _row("ok", name, f"worst relative error {error:.1e}, {1e3 * (time.perf_counter() - start):.0f} ms")
         except Exception as problem:  # reports whatever is wrong and continues
             _row("FAIL", name, f"{type(problem).__name__}: {problem}")
