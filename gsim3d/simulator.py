@@ -329,7 +329,7 @@ class Simulator(nn.Module):
         if rule is None and not config.is_asymmetric:
             return rollout(predict, state, n_steps, plan.history)
         if rule is not None:
-            changing = [name for name, who in self._changes(plan).items() if who != "none"]
+            changing = [name for name, which in self._changes(plan).items() if which != "none"]
             sleepers = Sleepers(rule, last_steps(state, 1), config.grid_size, plan.history, changing)
         remember = partial(self.dynamics.remember, generator=generator) if config.is_asymmetric else None
         options = {"remember": remember, "sleepers": sleepers, "log": log}
@@ -475,14 +475,8 @@ class Simulator(nn.Module):
         guard: Callable[..., Particles],
         geometry: Callable[[Particles], Pyramid] | None = None,
     ) -> Particles:
-        """Predicts and validates the next steps of every scene.
-
-        Args:
-            state: last steps of every scene.
-            background: context of frozen and sleeping particles; None if ``state`` contains all particles.
-            plan, generator, geometry: see :meth:`rollout`.
-            guard: validates the result.
-        """
+        """Predicts the next steps of every scene, validated by ``guard``; ``background`` has the particles that
+        ``state`` lacks. Others: see :meth:`rollout`."""
         changes, acting = self._changes(plan), state.actions is not None and plan.spec.dynamics.actions
         history = self.dynamics.actions.added(state, acting) if acting else state
         pyramid = None if geometry is None else geometry(history)
@@ -492,5 +486,5 @@ class Simulator(nn.Module):
         step = self.dynamics.actions.removed(step) if acting else step
         previous = [newest()] * self.config.dynamics.steps_per_call
         previous = concatenate(previous) if len(previous) > 1 else previous[0]
-        changed = [name for name, who in changes.items() if who != "none"]
+        changed = [name for name, which in changes.items() if which != "none"]
         return guard(step, previous=previous, changed=changed)

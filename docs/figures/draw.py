@@ -128,7 +128,7 @@ def serialization_and_patches() -> None:
 
 
 def static_background() -> None:
-    """Who reads whom in an asymmetric model."""
+    """What movable and frozen particles read in a symmetric and an asymmetric model."""
     figure, axes = canvas(7.6, 2.9, 15.2, 5.8)
     for left, title in ((0.3, "symmetric: every step reads all"), (7.9, "asymmetric: computed once, then read")):
         axes.add_patch(
