@@ -103,13 +103,20 @@ class _Sequence:
             {"size": [rig.get("width"), rig.get("height")]}, f"{self.source}: realsense.", problems
         ).size("size")
         self.serials = [self._serial(value) for value in serials]
+        if twice := next((serial for k, serial in enumerate(self.serials) if serial in self.serials[:k]), None):
+            raise InputError(f"{self.source}: realsense.serials lists camera {twice} twice")
         sides = self._meta.values.get("mano_sides", [])
         if not isinstance(sides, list) or any(side not in SIDES for side in sides) or len(set(sides)) < len(sides):
             raise InputError(f"{self.source}: mano_sides must be of {', '.join(SIDES)}; got {str(sides)[:80]}")
         self.sides = [side for side in SIDES if side in sides]
         self._rows = sides
         self._label_frames = [self._find_labels(serial) for serial in self.serials]
-        self.labelled = self.is_first or all(self._label_frames)
+        bare = [serial for serial, own in zip(self.serials, self._label_frames, strict=True) if not own]
+        self.labelled = self.is_first or not bare
+        if self.has_joints and bare:
+            self.notes.append(f"camera {', '.join(bare)}: has no label files, so masks are read of no camera")
+        if self.has_joints and "mano_sides" not in self._meta.values:
+            self.notes.append("mano_sides is missing: joints of hands are not read")
         self.types = [f"{side}_{joint}" for side in self.sides for joint in range(JOINTS)] if self.has_joints else []
 
     @property
@@ -185,7 +192,8 @@ class _Sequence:
         numbers = array([values.get(key) for key in keys], [(4,)], what, self.problems)
         if numbers is None:
             return np.eye(3)
-        if values.get("coeffs") not in (None, [0] * 5):
+        lens = values.get("coeffs")
+        if any(lens if isinstance(lens, list) else [lens]):
             self.notes.append(f"camera {serial}: lens coefficients are ignored, as the data set's tools do")
         # Pixel centres are integers in the files.
         fx, fy, cx, cy = numbers
@@ -293,28 +301,32 @@ class _Sequence:
         return RecordedActions(positions[:, points], names, present[:, points]) if names else None
 
     def check_rig(self, cameras: Sequence[Camera]) -> list[str]:
-        """Compares the joints of all cameras with the pixels in their labels; returns notes, reports a bad fit."""
-        spread, errors = [], []
+        """Compares the joints of each camera with their median and its labels; returns notes, reports a bad fit."""
+        apart, errors = ([[np.zeros(0)] for _ in cameras] for _ in range(2))
         for frame in evenly_spaced(self.n_steps, CHECKED_FRAMES) if self.types else ():
             seen = {cam: found for cam, camera in enumerate(cameras) if (found := self._seen(cam, frame, camera))}
             if len(seen) < 2:
                 continue
-            points = np.stack([positions for positions, _ in seen.values()])
-            middle = _median(points)
-            spread.append(np.linalg.norm(points - middle, axis=2).ravel())
-            for cam, (_, pixels) in seen.items():
+            middle = _median(np.stack([positions for positions, _ in seen.values()]))
+            for cam, (positions, pixels) in seen.items():
                 projected, _ = project(np.nan_to_num(middle), cameras[cam].viewmats, cameras[cam].Ks)
                 off = np.linalg.norm(projected - 0.5 - pixels, axis=1)
-                errors.append(np.where(np.isnan(middle[:, 0]), np.nan, off))
-        errors = np.concatenate(errors) if errors else np.zeros(0)
-        errors = errors[np.isfinite(errors)]
-        if not len(errors):
-            return []
-        error, apart = float(np.median(errors)), 1000 * float(np.nanmedian(np.concatenate(spread)))
-        found = f"hand joints of the cameras agree to {apart:.2g} mm and project to {error:.2g} px of their labels"
+                errors[cam].append(np.where(np.isnan(middle[:, 0]), np.nan, off))
+                apart[cam].append(1000 * np.linalg.norm(positions - middle, axis=1))
+        (distance, farthest), (error, worst) = (self._worst(values) for values in (apart, errors))
+        found = (
+            f"hand joints lie up to {distance:.1f} mm (camera {farthest}) from the median of all cameras, which projects "
+            f"up to {error:.1f} px (camera {worst}) off the labels"
+        )
         if error > MAX_ERROR:
             self.problems.add(f"{self.source}: the calibration does not fit: {found} (at most {MAX_ERROR:g} px)")
-        return [found] if apart > MAX_SPREAD or error > MAX_ERROR else []
+        return [found] if distance > MAX_SPREAD or error > MAX_ERROR else []
+
+    def _worst(self, values: Sequence[Sequence[np.ndarray]]) -> tuple[float, str]:
+        """Returns the largest median of the finite values of a camera, and the camera's serial."""
+        joined = [np.concatenate(own) for own in values]
+        known = [(own[np.isfinite(own)], serial) for own, serial in zip(joined, self.serials, strict=True)]
+        return max(((float(np.median(own)), serial) for own, serial in known if len(own)), default=(0.0, ""))
 
 
 def _names(serial: Any) -> list[str]:

@@ -131,12 +131,44 @@ def test_inverted_extrinsics_fail_the_rig_check(tmp_path):
         Scene.open(folder)
 
 
+def test_one_camera_that_is_off_fails_the_rig_check_by_its_serial(tmp_path):
+    folder = write_hocap(tmp_path, n_frames=4, gaps=False)
+    file = tmp_path / "calibration" / "extrinsics" / "extrinsics_20231014.yaml"
+    before = file.read_text()
+    for metres in (0.05, 1.0):
+        file.write_text(before)
+        edited(folder, file, lambda content: add(content["extrinsics"][SERIALS[2]], 3, metres))
+        (problem,) = check_scene(folder).problems
+        assert "calibration does not fit" in problem and f"px (camera {SERIALS[2]})" in problem
+
+
+def test_labels_that_cannot_be_used_are_noted(tmp_path):
+    folder = write_hocap(tmp_path, n_frames=2, gaps=False)
+    for file in (folder / SERIALS[1]).glob("label_*.npz"):
+        file.unlink()
+    edited(folder, folder / "meta.yaml", lambda meta: meta.pop("mano_sides"))
+    lens = tmp_path / "calibration" / "intrinsics" / f"{SERIALS[0]}.yaml"
+    edited(folder, lens, lambda content: content["color"].update(coeffs=[0.0] * 4))
+    scene = Scene.open(folder)
+    assert not scene.has_segmentation() and scene.recording.actions is None
+    assert scene.recording.notes == (
+        f"camera {SERIALS[1]}: has no label files, so masks are read of no camera",
+        "mano_sides is missing: joints of hands are not read",
+    )
+    edited(folder, lens, lambda content: content["color"].update(coeffs=[0.0, 0.1, 0.0, 0.0]))
+    assert any("lens coefficients are ignored" in note for note in Scene.open(folder).recording.notes)
+
+
 def test_contact_sheet_draws_joints_where_the_images_show_them(scene, capsys, folder, tmp_path):
     assert main(["check-data", str(folder), "--out", str(tmp_path / "sheet.png")]) == 0
     said = capsys.readouterr().out
     assert "actors: right_0, right_1, right_2, ... (42)" in said and "no problem" in said
     sheet = contact_sheet([scene])
     assert (np.abs(sheet.astype(int) - (90, 255, 90)).max(-1) < 40).sum() > 200
+
+
+def add(numbers, at, change):
+    numbers[at] += change
 
 
 def edited(folder, file, change):
@@ -149,6 +181,10 @@ def edited(folder, file, change):
 DAMAGE = {
     "num_frames": (lambda meta: meta.update(num_frames=40), "has 32 of num_frames 40 frames; the first missing is 32"),
     "serials": (lambda meta: meta["realsense"].update(serials=["1"]), "camera '1', which has no folder"),
+    "twice": (
+        lambda meta: meta["realsense"].update(serials=[SERIALS[0]] * 2),
+        f"lists camera {SERIALS[0]} twice",
+    ),
     "no serials": (lambda meta: meta.update(realsense=3), "realsense.serials must be a list"),
     "size": (lambda meta: meta["realsense"].update(width=None), "realsense.size"),
     "sides": (lambda meta: meta.update(mano_sides=["both"]), "mano_sides must be of right, left"),
