@@ -127,8 +127,8 @@ class LossConfig:
     #: weight of LPIPS (VGG), added to the squared error; 0.05 in the paper, 0.01 for its rigid bodies. Install its
     #: weights with `gsim3d weights lpips`.
     perceptual: float = 0.0
-    #: multiply the colour channels of each predicted image by the gains (2/3 to 3/2) that fit its target best, relative
-    #: to the mean gain of the batch, for cameras that differ in exposure or white balance
+    #: multiply the colour channels of each camera's predicted images by the gains (2/3 to 3/2) that fit all its targets
+    #: of the window best, relative to the scene's mean, for cameras that differ in exposure or white balance
     image_gain: bool = False
 
     REMOVED: ClassVar[dict] = {"shape": 0, "shape_length": ..., "bodies": 0}

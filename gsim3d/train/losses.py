@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from gsim3d.cameras import Frames
+from gsim3d.cameras import Cameras, Frames
 from gsim3d.evaluate.perceptual.lpips import LPIPS
 from gsim3d.train.config import LossConfig
 
@@ -28,7 +28,7 @@ def training_loss(
     if targets.valid is not None:
         weight = targets.valid.float() if weight is None else weight * targets.valid
     if settings.image_gain:
-        images = images * relative_gains(images.detach(), truth, weight)
+        images = images * relative_gains(images.detach(), truth, targets.cameras, n_steps, weight)
     step = targets.cameras.image_cloud % n_steps
     wrong = image_errors(images, truth, weight)
     if perceptual is not None:
@@ -64,17 +64,37 @@ def image_errors(pred: Tensor, target: Tensor, weight: Tensor | None = None) -> 
     return (errors * weight).sum((1, 2)) / weight.sum((1, 2)).clamp(min=LEAST_WEIGHT)
 
 
-def relative_gains(pred: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:
-    """Returns the gains [I, 1, 1, C] of images [I, H, W, C] with the least error, relative to their mean.
+def relative_gains(
+    pred: Tensor, target: Tensor, cameras: Cameras, n_steps: int, weight: Tensor | None = None
+) -> Tensor:
+    """Returns the gain of each camera of a scene, relative to the mean gain of the scene's images.
 
-    Gains lie between 1 / MAX_GAIN and MAX_GAIN. Without the division by their geometric mean over the images, a model
+    A gain has the least error over all given images of the camera, those of one scene and pose: training gives those of
+    a whole window, also where its gradients are cut. So an error that grows over time is not forgiven, unless the
+    camera moves. Gains lie between 1 / MAX_GAIN and MAX_GAIN. Without the division by their geometric mean, a model
     would not learn how bright a scene is.
+
+    Args:
+        pred, target: [I, H, W, C].
+        cameras: of the I images; ``image_cloud // n_steps`` is the scene.
+        n_steps: clouds of a scene.
+        weight: [I, H, W], of pixels; None: 1.
+
+    Returns:
+        [I, 1, 1, C].
     """
+    scene = cameras.image_cloud // n_steps
+    same_scene = scene[:, None] == scene
+    same_camera = same_scene & (cameras.viewmats[:, None] == cameras.viewmats).flatten(2).all(2)
     weight = 1 if weight is None else weight[..., None]
-    power = (weight * pred * pred).sum((1, 2), keepdim=True)
-    gain = (weight * pred * target).sum((1, 2), keepdim=True) / power.clamp(min=LEAST_WEIGHT)
-    gain = torch.where(power > 0, gain, 1).clamp(1 / MAX_GAIN, MAX_GAIN).log()
-    return (gain - gain.mean(0)).exp()
+    power, match = (_sums(same_camera, (weight * pred * other).sum((1, 2))) for other in (pred, target))
+    gain = torch.where(power > 0, match / power.clamp(min=LEAST_WEIGHT), 1).clamp(1 / MAX_GAIN, MAX_GAIN).log()
+    return (gain - _sums(same_scene, gain) / same_scene.sum(1, keepdim=True)).exp()[:, None, None]
+
+
+def _sums(member: Tensor, values: Tensor) -> Tensor:
+    """Sums values [I, C] over the members bool [I, I] of each image's group, in a fixed order."""
+    return (member[..., None] * values).sum(1)
 
 
 def mean_by_step(values: Tensor, step: Tensor, n_steps: int) -> Tensor:

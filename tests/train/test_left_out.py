@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from gsim3d.cameras import Cameras, Frames
 from gsim3d.data import Scene
 from gsim3d.errors import InputError
 from gsim3d.state import concatenate
@@ -15,7 +16,7 @@ from gsim3d.train.captured import CapturedLoss
 from gsim3d.train.config import DataConfig, LossConfig, PhaseConfig, TrainConfig
 from gsim3d.train.left_out import draw_left_out, images_per_cloud, with_views
 from gsim3d.train.loop import Trainer
-from gsim3d.train.losses import relative_gains, training_loss
+from gsim3d.train.losses import image_errors, relative_gains, training_loss
 from gsim3d.train.restore import restore
 from gsim3d.train.run import train
 from tests.tiny_scenes import write_scene
@@ -117,12 +118,22 @@ def test_captured_loss_leaves_out_the_same_particles(trainer):
             assert (known[id(parameter)] - gradient).norm() < 0.02 * gradient.norm()
 
 
-def test_gains_of_images_are_fitted_relative_to_their_mean(trainer):
+def cameras_of(n_scenes, n_steps, n_cameras):
+    poses = torch.eye(4).repeat(n_scenes * n_steps * n_cameras, 1, 1)
+    poses[:, 0, 3] = torch.arange(n_cameras).repeat(n_scenes * n_steps)
+    clouds = torch.arange(n_scenes * n_steps).repeat_interleave(n_cameras)
+    return Cameras(poses, torch.eye(3).expand(len(poses), 3, 3), *torch.ones(2, len(poses)), clouds, 8, 8)
+
+
+def test_gains_of_cameras_are_fitted_relative_to_their_mean(trainer):
     pred = torch.rand(3, 8, 8, 3, generator=torch.Generator().manual_seed(0))
     gains = torch.tensor([[1.2, 0.8, 1.0], [3.0, 0.1, 1.0], [1.0, 1.0, 1.0]])[:, None, None]
-    limited = gains.clamp(1 / 1.5, 1.5)
-    torch.testing.assert_close(relative_gains(pred, pred * gains), limited / limited.log().mean(0).exp())
-    assert (relative_gains(torch.zeros(2, 2, 2, 3), torch.ones(2, 2, 2, 3)) == 1).all()
+    limited, cameras = gains.clamp(1 / 1.5, 1.5), cameras_of(1, 1, 3)
+    expected = limited / limited.log().mean(0).exp()
+    torch.testing.assert_close(relative_gains(pred, pred * gains, cameras, 1), expected)
+    assert (relative_gains(torch.zeros_like(pred), torch.ones_like(pred), cameras, 1) == 1).all()
+    twice = relative_gains(pred.repeat(2, 1, 1, 1), torch.cat([pred * gains, pred / 2]), cameras_of(2, 1, 3), 1)
+    torch.testing.assert_close(twice, torch.cat([expected, torch.ones_like(expected)]))  # each scene of its own
     targets, weights = trainer._batch([0]).targets, torch.ones(3)
     truth = targets.images.permute(0, 2, 3, 1)
     exposure = torch.tensor([0.8, 1.0, 1.25]).repeat(3)[:, None, None, None]  # of the three cameras at each step
@@ -130,6 +141,22 @@ def test_gains_of_images_are_fitted_relative_to_their_mean(trainer):
         plain, _ = training_loss(LossConfig(), None, images, targets, weights)
         gained, _ = training_loss(LossConfig(image_gain=True), None, images, targets, weights)
         assert gained < 1e-6 * plain if forgiven else torch.isclose(gained, plain, rtol=1e-3)
+
+
+@pytest.mark.parametrize("fading", [(0, 1, 2), (1,)], ids=["all cameras", "one camera"])
+def test_gains_do_not_forgive_images_that_darken_over_time(fading):
+    truth = torch.rand(12, 8, 8, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    fade = torch.ones(4, 3, dtype=torch.float64)
+    fade[:, fading] = torch.linspace(1.2, 0.8, 4, dtype=torch.float64)[:, None]
+    images, cameras = (truth * fade.flatten()[:, None, None, None]).requires_grad_(), cameras_of(1, 4, 3)
+    gains = relative_gains(images.detach(), truth, cameras, 4)
+    assert gains.view(4, 3, 3).diff(dim=0).abs().max() < 1e-12
+    plain, gained = (image_errors(image, truth).mean() for image in (images, images * gains))
+    assert 0.9 * plain < gained < 1.1 * plain
+    targets = Frames(truth.permute(0, 3, 1, 2), cameras, torch.zeros(4).long(), torch.arange(4), torch.zeros(1, 3))
+    loss, _ = training_loss(LossConfig(image_gain=True), None, images, targets, torch.full((4,), 0.25).double())
+    gradient, expected = (torch.autograd.grad(of, images)[0] for of in (loss, gained))
+    torch.testing.assert_close(gradient, expected, rtol=1e-12, atol=1e-15)
 
 
 def test_run_trains_at_the_subsampled_rate_and_its_model_asks_for_it(tmp_path):
