@@ -315,8 +315,8 @@ class _Sequence:
                 apart[cam].append(1000 * np.linalg.norm(positions - middle, axis=1))
         (distance, farthest), (error, worst) = (self._worst(values) for values in (apart, errors))
         found = (
-            f"hand joints lie up to {distance:.1f} mm (camera {farthest}) from the median of all cameras, which projects "
-            f"up to {error:.1f} px (camera {worst}) off the labels"
+            f"hand joints lie up to {distance:.1f} mm (camera {farthest}) from the median of all cameras, which "
+            f"projects up to {error:.1f} px (camera {worst}) off the labels"
         )
         if error > MAX_ERROR:
             self.problems.add(f"{self.source}: the calibration does not fit: {found} (at most {MAX_ERROR:g} px)")
