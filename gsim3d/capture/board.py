@@ -47,6 +47,12 @@ class Board:
         if not whole or min(self.columns, self.rows) < 3 or not 0 < marker < self.square:
             raise InputError(f"--board: needs 3 whole squares or more a side, and smaller markers; got {self}")
         markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}"))
+        needed, held = int(self.columns * self.rows) // 2, len(markers.bytesList)
+        if needed > held:
+            raise InputError(
+                f"--board: {self.columns:g} x {self.rows:g} squares need {needed} markers; --dictionary "
+                f"{self.dictionary} has {held}"
+            )
         return cv2.aruco.CharucoBoard((int(self.columns), int(self.rows)), self.square, marker, markers)
 
 

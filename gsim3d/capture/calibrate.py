@@ -23,6 +23,7 @@ def calibrate(
     *,
     board: Board | None = None,
     scale: tuple[str, str, float] | None = None,
+    synchronous: bool = False,
     force: bool = False,
     say: Callable[[str], None] = print,
 ) -> list[Path]:
@@ -33,6 +34,7 @@ def calibrate(
             or else the films of the first take show it.
         board: the board; None: structure from motion.
         scale: two cameras and the distance between them in metres.
+        synchronous: keep the times in the files, instead of aligning films by motion.
         force: write cameras that do not fit, too.
         say: receives what was decided, and why.
 
@@ -55,7 +57,7 @@ def calibrate(
         say(f"calibrate: structure from motion of {len(films)} backgrounds, because no --board is given")
         cameras = calibrate_sfm(films)
     else:
-        offsets, _ = _offsets(films, say)
+        offsets, _ = _offsets(films, synchronous, say)
         cameras = calibrate_board(films, offsets, board)
     for camera in cameras:
         say(f"  {camera.name}: reprojection error {camera.error:.2f} px, {camera.views} images")
@@ -73,7 +75,7 @@ def calibrate(
             if film.size != camera.size:
                 raise InputError(f"{film.video.what}: has {film.size} pixels, the film of the board {camera.size}")
         say(f"{take}:")
-        offsets, agreement = _offsets(films, say)
+        offsets, agreement = _offsets(films, synchronous, say)
         before = read_json(take / FILE) if (take / FILE).is_file() else {}
         keys = {"resample": _common_rate(films, say), "masks": before.get("masks")}
         write_whole(take / FILE, _description(cameras, offsets, agreement, keys))
@@ -81,14 +83,16 @@ def calibrate(
     return [take / FILE for take in takes]
 
 
-def _offsets(films: Sequence[Film], say: Callable[[str], None]) -> tuple[np.ndarray, np.ndarray]:
+def _offsets(films: Sequence[Film], synchronous: bool, say: Callable[[str], None]) -> tuple[np.ndarray, list]:
+    if synchronous:
+        return np.zeros(len(films)), [None] * len(films)
     offsets, agreement = time_offsets([film.video.times for film in films], [film.motion for film in films])
     for film, offset, own in zip(films, offsets, agreement, strict=True):
         why = f"motion correlates by {own:.2f}"
         if own < MIN_AGREEMENT:
             why += f", below {MIN_AGREEMENT}: the times in the file are kept; clap once in view of all cameras"
         say(f"  {film.name}: {1000 * offset:+.0f} ms ({why})")
-    return offsets, agreement
+    return offsets, agreement.tolist()
 
 
 def _scaled(cameras: list[Calibrated], scale, metric: bool, say) -> list[Calibrated]:
@@ -119,7 +123,7 @@ def _description(cameras: Sequence[Calibrated], offsets, agreement, keys: dict) 
         numbers = camera.K, camera.viewmat[:3, :3], camera.viewmat[:3, 3], camera.distortion
         K, R, T, lens = (values.tolist() for values in numbers)
         entry = {"name": camera.name, "size": list(camera.size), "K": K, "R": R, "T": T, "distortion": lens}
-        found = {"error": camera.error, "images": camera.views, "motion_agreement": float(own)}
+        found = {"error": camera.error, "images": camera.views, "motion_agreement": own}
         entries.append(entry | {"offset": round(float(offset), 6), "calibration": found})
     content = {"pixel_center": 0, **{key: value for key, value in keys.items() if value}, "cameras": entries}
     return json.dumps(content, indent=1) + "\n"

@@ -22,6 +22,8 @@ MOTION_WIDTH = 160  # pixels, of the images in which motion is measured
 MAX_LAG = 10.0  # seconds; films that start further apart cannot be aligned
 MIN_OVERLAP = 0.5  # of the shorter film, at any tested lag
 MIN_AGREEMENT = 0.5  # correlation of the motion in two films
+CHANCE = 1.0  # standard deviations; less agreement without offsets counts as this
+MARGIN = 2.5  # standard deviations a film; synchronous ones at most 60 degrees apart reach 2.3, late ones from 2.9
 MIN_VARIATION = 0.1  # of the motion, over its mean; films that show less are not aligned
 MIN_FRAMES = 16
 REPEATED = 0.1  # of the median motion; frames that change less repeat the one before
@@ -81,11 +83,11 @@ def takes_of(folder: Path) -> dict[Path, list[Path]]:
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder")
     below = [path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != "." and path.name != BOARD]
-    takes = {take: films_in(take) for take in (folder, *below)}
-    takes = {folder: takes[folder]} if takes[folder] else {take: films for take, films in takes.items() if films}
+    own = films_in(folder)
+    takes = {folder: own} if own else {take: films for take in below if (films := films_in(take))}
     for take, films in takes.items():
         names, first = [film.stem for film in films], [film.stem for film in next(iter(takes.values()))]
-        if len(set(names)) < max(2, len(names)) or names != first:
+        if len(names) < 2 or names != first:
             raise InputError(
                 f"{take}: has films of {', '.join(names)}; every take needs one film of the same two cameras or more "
                 f"({', '.join(first)})"
@@ -96,10 +98,14 @@ def takes_of(folder: Path) -> dict[Path, list[Path]]:
 
 
 def films_in(folder: Path) -> list[Path]:
-    """Returns the film files in ``folder``, in natural order."""
+    """Returns the film files in ``folder``, in natural order. Raises InputError if two are of one camera."""
     files = filter(Path.is_file, folder.iterdir()) if folder.is_dir() else ()
     films = [file for file in files if file.suffix.lower() in VIDEO_SUFFIXES and file.name[0] != "."]
-    return sorted(films, key=lambda file: natural_order(file.name))
+    films.sort(key=lambda file: natural_order(file.name))
+    for film, other in itertools.combinations(films, 2):
+        if film.stem == other.stem:
+            raise InputError(f"{folder}: has two films of camera {film.stem}: {film.name} and {other.name}; remove one")
+    return films
 
 
 def time_offsets(times: Sequence[np.ndarray], motions: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -107,7 +113,8 @@ def time_offsets(times: Sequence[np.ndarray], motions: Sequence[np.ndarray]) -> 
 
     The lag of two films is the peak of the normalised cross-correlation of the relative change of their motion, which
     depends less on the view than motion itself, by its significance (Fisher's z): a few frames that happen to agree
-    count less than many. Offsets follow from the pairs whose peaks are most significant.
+    count less than many. Offsets follow from the pairs whose peaks are most significant. All are 0 unless they make the
+    films agree clearly better: views of one motion differ, so that synchronous films, too, have their peaks elsewhere.
 
     Args:
         times: seconds of the frames of each of V films.
@@ -115,7 +122,8 @@ def time_offsets(times: Sequence[np.ndarray], motions: Sequence[np.ndarray]) -> 
 
     Returns:
         Offsets [V] in seconds to add to the times of each film, that of the first is 0; and the best correlation [V]
-        of each film with another. Films that correlate by less than MIN_AGREEMENT with all others have offset 0.
+        of each film with another at these offsets. Films that correlate by less than MIN_AGREEMENT with all others have
+        offset 0.
     """
     n = len(times)
     step = min(float(np.median(np.diff(own))) for own in times) / GRID
@@ -125,15 +133,18 @@ def time_offsets(times: Sequence[np.ndarray], motions: Sequence[np.ndarray]) -> 
         grid = np.arange(middle[0], middle[-1], step)
         signals.append((middle[0], np.gradient(_smooth(np.interp(grid, middle, np.log1p(values)), GRID))))
     varied = [k for k, own in enumerate(motions) if len(own) >= MIN_FRAMES and own.std() > MIN_VARIATION * own.mean()]
-    most, among = round(MAX_LAG / step), itertools.combinations(varied, 2)
-    pairs = {(a, b): _lag(signals[a][1], signals[b][1], most) for a, b in among}
-    best = np.array([max((r for pair, (_, r, _) in pairs.items() if k in pair), default=0.0) for k in range(n)])
-    offsets: dict[int, float] = {}
-    while joins := [p for p in pairs if pairs[p][1] >= MIN_AGREEMENT and len(offsets.keys() & p) == bool(offsets)]:
-        a, b = max(joins, key=lambda pair: pairs[pair][2])
-        apart = pairs[a, b][0] * step + signals[a][0] - signals[b][0]
-        offsets |= {a: offsets[b] - apart} if b in offsets else {b: offsets.setdefault(a, 0.0) + apart}
-    return np.array([offsets[k] - offsets.get(0, 0) if k in offsets else 0.0 for k in range(n)]), best
+    pairs = {(a, b): _correlations(signals[a], signals[b], step) for a, b in itertools.combinations(varied, 2)}
+    peaks = {pair: _peak(*own) for pair, own in pairs.items()}
+    known: dict[int, float] = {}
+    while joins := [p for p in pairs if peaks[p][1] >= MIN_AGREEMENT and len(known.keys() & p) == bool(known)]:
+        a, b = max(joins, key=lambda pair: peaks[pair][2])
+        known |= {a: known[b] - peaks[a, b][0]} if b in known else {b: known.setdefault(a, 0.0) + peaks[a, b][0]}
+    offsets = np.array([known[k] - known.get(0, 0) if k in known else 0.0 for k in range(n)])
+    lags = {(a, b): [0.0, offsets[b] - offsets[a]] for a, b in pairs}
+    matches = {pair: [np.interp(lags[pair], own[0], row) for row in own[1:]] for pair, own in pairs.items()}
+    late = sum(z[1] - max(z[0], CHANCE) for _, z in matches.values()) > MARGIN * max(0, len(known) - 1)
+    agreement = [max((r[int(late)] for pair, (r, _) in matches.items() if k in pair), default=0.0) for k in range(n)]
+    return np.where(late, offsets, 0.0), np.array(agreement)
 
 
 def _smooth(values: np.ndarray, sigma: float) -> np.ndarray:
@@ -142,18 +153,25 @@ def _smooth(values: np.ndarray, sigma: float) -> np.ndarray:
     return np.convolve(np.pad(values, reach, mode="edge"), kernel / kernel.sum(), "valid")
 
 
-def _lag(a: np.ndarray, b: np.ndarray, most: int) -> tuple[float, float, float]:
-    """Returns by how many samples ``b`` must be delayed to match ``a``, and their correlation and its significance."""
-    least, found = max(3, int(MIN_OVERLAP * min(len(a), len(b)))), []
+def _correlations(first: tuple, second: tuple, step: float) -> np.ndarray:
+    """Returns [3, K]: lags in seconds of ``second`` (begin, samples of duration ``step``) relative to ``first``, their
+    correlations and significances."""
+    (start, a), (other, b), most, found = first, second, round(MAX_LAG / step), []
+    least = max(3, int(MIN_OVERLAP * min(len(a), len(b))))
     for lag in range(-most, most + 1):
         low, high = max(0, lag), min(len(a), len(b) + lag)
         if high - low >= least:
             x, y = a[low:high] - a[low:high].mean(), b[low - lag : high - lag] - b[low - lag : high - lag].mean()
             r = float((x * y).sum() / max(1e-12, np.sqrt((x * x).sum() * (y * y).sum())))
-            found.append((lag, r, np.arctanh(min(r, 0.9999)) * np.sqrt(max(1, (high - low) / APART - 3))))
-    top = max(range(len(found)), key=lambda k: found[k][2])
-    (lag, r, z), fine = found[top], 0.0
-    if 0 < top < len(found) - 1:
-        left, right = found[top - 1][1], found[top + 1][1]
-        fine = float(np.clip(0.5 * (left - right) / min(-1e-12, left - 2 * r + right), -1, 1))
-    return lag + fine, r, float(z)
+            z = np.arctanh(min(r, 0.9999)) * np.sqrt(max(1, (high - low) / APART - 3))
+            found.append((lag * step + start - other, r, z))
+    return np.array(found).T
+
+
+def _peak(lags: np.ndarray, r: np.ndarray, z: np.ndarray) -> tuple[float, float, float]:
+    """Returns the lag of largest significance, between samples, and its correlation and significance."""
+    top, fine = int(z.argmax()), 0.0
+    if 0 < top < len(z) - 1:
+        left, right = r[top - 1], r[top + 1]
+        fine = float(np.clip(0.5 * (left - right) / min(-1e-12, left - 2 * r[top] + right), -1, 1))
+    return lags[top] + fine * (lags[1] - lags[0]), r[top], z[top]

@@ -2,6 +2,7 @@
 
 import tempfile
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 import cv2
@@ -32,14 +33,15 @@ def calibrate_sfm(films: Sequence[Film]) -> list[Calibrated]:
         raise InputError(
             "calibration without a board needs pycolmap: pip install 'gsim3d[capture]' (or film a board: --board)"
         ) from error
-    with tempfile.TemporaryDirectory() as temporary:
+    with tempfile.TemporaryDirectory() as temporary, ExitStack() as after:
         images, database = Path(temporary) / "images", Path(temporary) / "features.db"
         images.mkdir()
         for film in films:
             video = film.video
             background = background_image(lambda at: np.stack([*video.read(at, Problems())]), len(video.times))
             cv2.imwrite(str(images / f"{film.name}.png"), background[..., ::-1])
-        pycolmap.logging.minloglevel = pycolmap.logging.ERROR
+        after.callback(setattr, pycolmap.logging, "minloglevel", pycolmap.logging.minloglevel)
+        pycolmap.logging.minloglevel = pycolmap.logging.FATAL  # a missing model is an error below
         options = pycolmap.IncrementalPipelineOptions()
         options.min_model_size, options.mapper.init_min_num_inliers = 2, 30
         pycolmap.set_random_seed(0)

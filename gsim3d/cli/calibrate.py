@@ -7,8 +7,8 @@ tilted, into all corners of every image, then lay it on the floor in view of a c
 board at the end: z points out of its printed side, lengths are metres. Without --board, COLMAP matches features of
 the still background (pip install 'gsim3d[capture]'); lengths are metres with --scale only.
 
-Films that start at different times are aligned by the motion that they show. Writes cameras.json beside the films
-(docs/reference/data.md, videos), with the reprojection error of each camera.
+Films that start at different times are aligned by the motion that they show, if it then agrees clearly better. Writes
+cameras.json beside the films (docs/reference/data.md, videos), with the reprojection error of each camera.
 
 examples:
   gsim3d calibrate films --board 7 5 0.04
@@ -25,6 +25,7 @@ from gsim3d.errors import InputError
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", metavar="DIR", help="folder with the films of a take, or with a folder for each take")
     add_calibration(parser)
+    parser.add_argument("--synchronous", action="store_true", help="the films start at one time: do not align them")
     parser.add_argument("--force", action="store_true", help="also write a calibration that does not fit")
 
 
@@ -53,5 +54,5 @@ def calibration_of(args: argparse.Namespace) -> dict[str, Any]:
 def run(args: argparse.Namespace) -> int:
     from gsim3d.capture.calibrate import calibrate
 
-    calibrate(args.folder, **calibration_of(args), force=args.force)
+    calibrate(args.folder, **calibration_of(args), synchronous=args.synchronous, force=args.force)
     return 0

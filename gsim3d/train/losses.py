@@ -67,34 +67,20 @@ def image_errors(pred: Tensor, target: Tensor, weight: Tensor | None = None) -> 
 def relative_gains(
     pred: Tensor, target: Tensor, cameras: Cameras, n_steps: int, weight: Tensor | None = None
 ) -> Tensor:
-    """Returns the gain of each camera of a scene, relative to the mean gain of the scene's images.
+    """Returns gains [I, 1, 1, C] of images [I, H, W, C], one for each camera of a scene, relative to the scene's mean.
 
-    A gain has the least error over all given images of the camera, those of one scene and pose: training gives those of
-    a whole window, also where its gradients are cut. So an error that grows over time is not forgiven, unless the
-    camera moves. Gains lie between 1 / MAX_GAIN and MAX_GAIN. Without the division by their geometric mean, a model
-    would not learn how bright a scene is.
-
-    Args:
-        pred, target: [I, H, W, C].
-        cameras: of the I images; ``image_cloud // n_steps`` is the scene.
-        n_steps: clouds of a scene.
-        weight: [I, H, W], of pixels; None: 1.
-
-    Returns:
-        [I, 1, 1, C].
+    A gain has the least error over all given images of one pose and scene (``cameras.image_cloud // n_steps``), in
+    training those of a whole window, also where gradients are cut. So errors that grow over time are not forgiven,
+    unless the camera moves. Gains lie between 1 / MAX_GAIN and MAX_GAIN. Without the division by their geometric mean
+    over the images of the scene, a model would not learn how bright it is.
     """
     scene = cameras.image_cloud // n_steps
-    same_scene = scene[:, None] == scene
-    same_camera = same_scene & (cameras.viewmats[:, None] == cameras.viewmats).flatten(2).all(2)
+    same_scene = (scene[:, None] == scene)[..., None]
+    same_camera = same_scene & (cameras.viewmats[:, None] == cameras.viewmats).flatten(2).all(2, keepdim=True)
     weight = 1 if weight is None else weight[..., None]
-    power, match = (_sums(same_camera, (weight * pred * other).sum((1, 2))) for other in (pred, target))
+    power, match = ((same_camera * (weight * pred * other).sum((1, 2))).sum(1) for other in (pred, target))
     gain = torch.where(power > 0, match / power.clamp(min=LEAST_WEIGHT), 1).clamp(1 / MAX_GAIN, MAX_GAIN).log()
-    return (gain - _sums(same_scene, gain) / same_scene.sum(1, keepdim=True)).exp()[:, None, None]
-
-
-def _sums(member: Tensor, values: Tensor) -> Tensor:
-    """Sums values [I, C] over the members bool [I, I] of each image's group, in a fixed order."""
-    return (member[..., None] * values).sum(1)
+    return (gain - (same_scene * gain).sum(1) / same_scene.sum(1)).exp()[:, None, None]
 
 
 def mean_by_step(values: Tensor, step: Tensor, n_steps: int) -> Tensor:

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from gsim3d.capture.board import Board, calm_times
+from gsim3d.capture.board import Board, Calibrated, calm_times
 from gsim3d.capture.calibrate import _common_rate, calibrate
-from gsim3d.capture.films import Film, takes_of, time_offsets
+from gsim3d.capture.films import Film, films_in, takes_of, time_offsets
 from gsim3d.cli.main import main
 from gsim3d.data import Scene, find_scenes
 from gsim3d.data.lenses import Undistorter
@@ -18,6 +18,7 @@ from gsim3d.data.recording import Lens, Problems
 from gsim3d.data.video_file import Video
 from gsim3d.errors import InputError
 from tests.capture.made_films import FPS, SIZE, rig, write_board_films, write_textured_films
+from tests.capture.made_takes import write_take
 from tests.data.made_videos import with_gaps, write_plain
 from tests.tiny_scenes import write_scenes
 from tools.films import Damage, degraded, write_films
@@ -152,6 +153,25 @@ def test_short_films_are_not_aligned_by_a_few_frames_that_agree():
     assert wrong <= 4
 
 
+@pytest.mark.parametrize("degrees", [(0, 25, 50), (0, 40, 80), (0, 60, 120), (0, 90)])
+def test_synchronous_films_keep_their_times(tmp_path, degrees):
+    films = [Film.open(file) for file in films_in(write_take(tmp_path / "take", degrees))]
+    offsets, _ = time_offsets([film.video.times for film in films], [film.motion for film in films])
+    assert (offsets == 0).all()
+
+
+def test_synchronous_films_are_not_aligned_by_option(tmp_path, monkeypatch):
+    def calibrated(films, offsets, board):
+        return [Calibrated(film.name, film.size, np.eye(3), np.zeros(5), np.eye(4), 0.1, 9) for film in films]
+
+    monkeypatch.setattr("gsim3d.capture.calibrate.calibrate_board", calibrated)
+    folder = write_take(tmp_path / "take", n_frames=150, starts=(0, 3, 6))
+    for option, starts in ([], [0, 3, 6]), (["--synchronous"], [0, 0, 0]):
+        assert main(["calibrate", str(folder), "--board", "7", "5", "0.04", *option]) == 0
+        offsets = [entry["offset"] for entry in cameras_of(folder)[0]]
+        np.testing.assert_allclose(np.array(offsets) * 30, starts, atol=0 if option else 0.5)
+
+
 def test_films_without_common_motion_keep_their_times():
     rng, times = np.random.default_rng(1), [np.arange(90) / 30] * 2
     still = time_offsets(times, [np.full(89, 2.0) + rng.normal(0, 0.01, 89) for _ in times])
@@ -170,11 +190,13 @@ def test_structure_from_motion_with_a_scale(tmp_path):
         assert np.linalg.norm(found[:3, 3] - true[:3, 3]) < 0.1
 
 
-def test_cameras_without_common_features_are_refused(tmp_path):
-    pytest.importorskip("pycolmap")
+def test_cameras_without_common_features_are_refused(tmp_path, capfd):
+    pycolmap = pytest.importorskip("pycolmap")
+    before = pycolmap.logging.minloglevel
     write_textured_films(tmp_path, rig((-170, 0, 100), 1.0))
     with pytest.raises(InputError, match="structure from motion connects . of 3 cameras"):
         calibrate(tmp_path, say=lambda _: None)
+    assert "Failed" not in capfd.readouterr().err and pycolmap.logging.minloglevel == before
 
 
 def test_missing_pycolmap_names_the_extra(films, monkeypatch):
@@ -223,12 +245,19 @@ def test_takes_are_found_or_refused(tmp_path, capsys):
         "one": ["left", "right"],
         "two": ["left", "right"],
     }
+    (tmp_path / "two" / "right.avi").write_bytes(b"")
+    with pytest.raises(InputError, match=r"two: has two films of camera right: right.avi and right.mp4"):
+        takes_of(tmp_path)
+    (tmp_path / "two" / "right.avi").unlink()
     (tmp_path / "two" / "right.mp4").unlink()
     with pytest.raises(InputError, match=r"two: has films of left; every take needs .* same two cameras"):
         takes_of(tmp_path)
     for columns in ("2", "5.5"):
         assert main(["calibrate", str(tmp_path), "--board", columns, "5", "0.1"]) == 2
         assert "--board: needs 3 whole squares or more a side" in capsys.readouterr().err
+    for squares, needed in ("20", 200), ("100000", 5_000_000_000):
+        assert main(["calibrate", str(tmp_path), "--board", squares, squares, "0.1"]) == 2
+        assert f"squares need {needed} markers; --dictionary 4X4_50 has 50" in capsys.readouterr().err
     assert main(["calibrate", str(tmp_path), "--scale", "left", "right", "-3"]) == 2
     assert "M must be a positive number of metres; got '-3'" in capsys.readouterr().err
 
