@@ -1,5 +1,6 @@
 """What planners need for PushToGoal: dynamics over sequences of pusher velocities, and a cost."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,8 +9,9 @@ from torch import Tensor
 
 from gsim3d.envs.model import ModelScenes, ModelState
 from gsim3d.envs.push import PushToGoal, bounded_velocity
+from gsim3d.errors import InputError
 from gsim3d.synth.cameras import Rig
-from gsim3d.synth.pushing import PUSHER_RADIUS, SIZE, PushSimulation
+from gsim3d.synth.pushing import PUSHER_RADIUS, SIZE
 from gsim3d.synth.scene_setup import Unstable
 
 BEHIND = SIZE / 2 + PUSHER_RADIUS  # metres behind the body, seen from the goal, where the pusher should be
@@ -31,26 +33,28 @@ class TrueDynamics:
     """Dynamics for planners: MuJoCo itself, one sequence after the other.
 
     Args:
-        simulation: of the episode; every call leaves it in the state that was given.
+        task: simulates in the episode that it has at each call, and leaves it in the state that was given.
     """
 
-    def __init__(self, simulation: PushSimulation):
-        self.simulation = simulation
+    def __init__(self, task: PushToGoal):
+        self.task = task.unwrapped
 
     def __call__(self, state: np.ndarray, actions: Tensor) -> PushStates:
-        """Positions after each of ``actions`` [K, H, 2], m/s, from ``state``."""
-        simulation, shape = self.simulation, tuple(actions.shape)
+        """Positions after each of ``actions`` [K, H, 2], m/s, from ``state``, one of the current episode."""
+        simulation, shape = self.task.simulation, tuple(actions.shape)
+        if len(shape) != 3 or shape[2] != 2:
+            raise InputError(f"actions must be [K, H, 2]; got {list(shape)}")
         centers, pusher = np.full(shape, np.nan), np.full(shape, np.nan)
-        for k, sequence in enumerate(actions.detach().double().cpu()):
+        try:
+            for k, sequence in enumerate(actions.detach().double().cpu()):
+                simulation.restore(state)
+                with suppress(Unstable):
+                    for step, action in enumerate(sequence):
+                        velocity = bounded_velocity(torch.from_numpy(simulation.pusher[:2]), action)
+                        simulation.step(velocity.numpy())
+                        centers[k, step], pusher[k, step] = simulation.centers[0, :2], simulation.pusher[:2]
+        finally:
             simulation.restore(state)
-            try:
-                for step, action in enumerate(sequence):
-                    velocity = bounded_velocity(torch.from_numpy(simulation.pusher[:2]), action)
-                    simulation.step(velocity.numpy())
-                    centers[k, step], pusher[k, step] = simulation.centers[0, :2], simulation.pusher[:2]
-            except Unstable:
-                continue
-        simulation.restore(state)
         return PushStates(torch.from_numpy(centers), torch.from_numpy(pusher))
 
 

@@ -338,17 +338,32 @@ def test_benchmark_plans_in_a_model_from_images_of_the_truth(monkeypatch, capsys
     episode = bench.run("model", env, 1000, scenes=scenes, reach=0.5, chunk=2)
     assert episode["steps"] == 6 and len(episode["plan_seconds"]) == len(episode["errors"]) == 2
     assert np.array(episode["errors"]).shape == (2, 2, 8) and np.isfinite(episode["errors"]).all()
+    assert len(episode["encode_seconds"]) == 2 and episode["plan_steps"] == [8 * (3 + 1)] * 2  # and that of the mean
     found = bench.summary([episode, bench.run("zero", env, 1000)])
     bench.show("model", found)
     assert found["solved"] == 0 and len(found["median_errors"]["model"]) == 8
-    assert "solved 0 of 2 (95 %: 0% to 66%)" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "solved 0 of 2 (95 %: 0% to 66%)" in shown and "s to encode" in shown
+
+
+def test_random_actions_of_the_benchmark_are_held_and_independent_of_the_scene(monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "tools" / "bench"))
+    env, given = gymnasium.make("gsim3d/PushToGoal-v0", max_episode_steps=8), []
+    step = env.step
+    monkeypatch.setattr(env, "step", lambda action: (given.append(action), step(action))[1])
+    importlib.import_module("push_planning").run("random", env, 1000)
+    given = np.stack(given).reshape(2, 4, 2)
+    assert (given == given[:, :1]).all() and (given[0, 0] != given[1, 0]).all()
+    scene = np.random.default_rng(1000).uniform(-0.5, 0.5, 2)
+    assert np.abs(given[0, 0] - scene).min() > 1e-3
 
 
 def test_benchmark_goes_on_from_its_file(monkeypatch, capsys, tmp_path, model):
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "tools" / "bench"))
     bench = importlib.import_module("push_planning")
     called, wanted = [], bench.run
-    episode = {"solved": True, "distance": 0.1, "steps": 3, "plan_seconds": [1.0], "errors": [[[0.01] * 8] * 2]}
+    episode = {"solved": True, "distance": 0.1, "steps": 3, "plan_seconds": [1.0]}
+    episode |= {"encode_seconds": [0.5], "plan_steps": [100], "errors": [[[0.01] * 8] * 2]}
 
     def run(agent, env, seed, **options):
         called.append((agent, seed))

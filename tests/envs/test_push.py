@@ -228,7 +228,7 @@ def test_later_actions_change_no_earlier_state():
     env = make()
     env.reset(seed=4)
     simulation = env.unwrapped.simulation
-    state, dynamics = simulation.state(), TrueDynamics(simulation)
+    state, dynamics = simulation.state(), TrueDynamics(env)
     actions = torch.rand(2, 6, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) - 0.5
     actions[1, :3] = actions[0, :3]
     states = dynamics(state, actions)
@@ -239,6 +239,21 @@ def test_later_actions_change_no_earlier_state():
     for step, action in enumerate(actions[0].numpy()):
         simulation.step(action)
         assert np.array_equal(simulation.centers[0, :2], states.centers[0, step].numpy())
+
+
+def test_dynamics_simulate_the_current_episode_and_leave_it_as_it_was():
+    env = make()
+    env.reset(seed=1)
+    dynamics, actions = TrueDynamics(env), torch.full((1, 3, 2), 0.3)
+    env.reset(seed=2)
+    simulation = env.unwrapped.simulation
+    state = simulation.state()
+    assert torch.equal(dynamics(state, actions).centers, TrueDynamics(env)(state, actions).centers)
+    actions[0, 1] = torch.nan
+    for wrong, words in ((actions, "velocity must be"), (torch.zeros(1, 2, 3), r"actions must be \[K, H, 2\]; got")):
+        with pytest.raises(InputError, match=words):
+            dynamics(state, wrong)
+        assert np.array_equal(simulation.state(), state)
 
 
 def test_cost_prefers_bodies_at_the_goal_and_pushers_behind_the_body():
@@ -256,7 +271,7 @@ def test_a_planner_in_the_truth_solves_an_episode():
     _, info = env.reset(seed=1)
     task = env.unwrapped
     planner = MPPI(
-        TrueDynamics(task.simulation), GoalCost(torch.from_numpy(task.goal)),
+        TrueDynamics(task), GoalCost(torch.from_numpy(task.goal)),
         env.action_space.low, env.action_space.high, horizon=8, samples=32, iterations=2, noise=0.3,
     )  # fmt: skip
     executed, terminated = 0, False
