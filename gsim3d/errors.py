@@ -1,9 +1,11 @@
 """Typed errors, which the command line reports in one line with exit code 2, and shared checks."""
 
 import difflib
+import math
 import platform
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -109,6 +111,13 @@ def check_one_of(name: str, value: object, known: Iterable[str]) -> None:
     if not isinstance(value, str) or value not in known:
         got = f"got {repr(value)[:100]}{did_you_mean(value, known)}"
         raise InputError(f"{name} must be one of {', '.join(known)}; {got}")
+
+
+def check_whole(name: str, value: object, least: int = 1, most: float = math.inf) -> None:
+    """Raises InputError if ``value`` is not a whole number from ``least`` to ``most``."""
+    if not isinstance(value, Integral) or isinstance(value, bool) or not least <= value <= most:
+        bound = f"of at least {least}" if most == math.inf else f"from {least} to {most}"
+        raise InputError(f"{name} must be a whole number {bound}; got {value!r}")
 
 
 def check_ranges(config: Any, **ranges: tuple[float, float]) -> None:

@@ -19,14 +19,14 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from numbers import Integral
+from numbers import Real
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsim3d.errors import InputError, NumericalError
+from gsim3d.errors import InputError, NumericalError, check_whole
 
 BISECTIONS = 60  # halvings of the interval of log temperature: more than a double resolves
 WIDEST = 60.0  # the interval is exp(-WIDEST) to exp(WIDEST) times the spread of the costs
@@ -80,16 +80,17 @@ class Planner(ABC):
     ):
         counts = {"horizon": horizon, "samples": samples, "iterations": iterations}
         for name, value in {**counts, "chunk": samples if chunk is None else chunk}.items():
-            if not isinstance(value, Integral) or value < 1:
-                raise InputError(f"{name} must be a whole number of at least 1; got {value!r}")
+            check_whole(name, value)
+        check_whole("seed", seed, 0, 2**64 - 1)
         low, high = torch.as_tensor(low), torch.as_tensor(high)
         same = low.shape == high.shape and low.device == high.device and low.dtype == high.dtype
         if not same or low.dim() != 1 or not low.is_floating_point():
             raise InputError("low and high must be vectors [A] of one length, floating dtype and device")
         if not low.isfinite().all() or not high.isfinite().all() or not (low < high).all():
             raise InputError("low and high must be finite, with low below high in every element")
-        if not (noise > 0 and math.isfinite(noise)) or not (color >= 0 and math.isfinite(color)):
-            raise InputError(f"noise must be positive and color 0 or more; got {noise} and {color}")
+        real = isinstance(noise, Real) and isinstance(color, Real)
+        if not real or not (0 < noise < math.inf and 0 <= color < math.inf):
+            raise InputError(f"noise must be positive and color 0 or more; got {noise!r} and {color!r}")
         self.dynamics, self.cost, self.low, self.high = dynamics, cost, low, high
         self.horizon, self.samples, self.iterations = horizon, samples, iterations
         self.noise, self.color, self.chunk = noise, color, chunk
@@ -112,8 +113,7 @@ class Planner(ABC):
         Raises:
             NumericalError: no sequence has a finite cost.
         """
-        if not isinstance(executed, Integral) or executed < 0:
-            raise InputError(f"executed must be a whole number of 0 or more; got {executed!r}")
+        check_whole("executed", executed, 0)
         best = _Best(_shifted(self._last, executed))
         with torch.no_grad():
             self._search(state, best, executed)
@@ -132,7 +132,7 @@ class Planner(ABC):
         return torch.where(costs.isfinite(), costs, math.inf)
 
     def _evaluate(self, state: Any, actions: Tensor) -> Tensor:
-        costs = self.cost(self.dynamics(state, actions), actions)
+        costs = self.cost(self.dynamics(state, actions.clone()), actions.clone())  # both may edit them in place
         if not isinstance(costs, Tensor) or costs.shape != (len(actions),):
             got = list(costs.shape) if isinstance(costs, Tensor) else type(costs).__name__
             raise InputError(f"cost must return a tensor with one value a sequence [{len(actions)}]; got {got}")
@@ -264,6 +264,7 @@ class GradientDescent(Planner):
             actions = (scaled.detach() * scale).clamp(self.low, self.high)[None]
             best.update(actions, self._costs(state, actions))
             best.history.append(best.cost)
+        best.history += [best.cost] * (self.iterations - len(best.history))
 
 
 class _Best:

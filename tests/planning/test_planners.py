@@ -75,6 +75,26 @@ def test_plans_do_not_depend_on_chunks_and_are_functions_of_the_seed(kind):
     assert torch.equal(agent.plan(START).actions, first.actions)
 
 
+@pytest.mark.parametrize("kind", PLANNERS)
+def test_dynamics_and_cost_may_edit_actions_in_place(kind):
+    def dynamics(state, actions):
+        states = double_integrator(state, actions)
+        actions += 1
+        return states
+
+    def cost(states, actions):
+        costs = quadratic(states, actions.clone())
+        actions += 1
+        return costs
+
+    assert torch.equal(planner(kind, dynamics, cost).plan(START).actions, planner(kind).plan(START).actions)
+
+
+def test_history_has_all_iterations_where_gradients_are_not_finite():
+    norm = planner("gradient", lambda state, actions: actions, lambda s, _: s.square().sum((1, 2)).sqrt(), samples=1)
+    assert norm.plan(START).history == (0.0,) * 30
+
+
 @pytest.mark.parametrize("executed", [0, 1, 4])
 def test_a_plan_begins_with_the_last_one_without_executed_actions(executed):
     agent = planner("mppi")
@@ -111,7 +131,12 @@ def test_sequences_without_a_finite_cost_are_never_chosen(kind):
         ({"horizon": 0}, "horizon must be a whole number of at least 1"),
         ({"samples": 2.5}, "samples must be a whole number of at least 1; got 2.5"),
         ({"chunk": 0}, "chunk must be a whole number of at least 1"),
+        ({"horizon": True}, "horizon must be a whole number of at least 1; got True"),
         ({"noise": -1.0}, "noise must be positive"),
+        ({"noise": "a"}, "noise must be positive and color 0 or more; got 'a'"),
+        ({"seed": None}, "seed must be a whole number from 0 to .*; got None"),
+        ({"seed": 1.5}, "seed must be a whole number"),
+        ({"seed": 2**70}, "seed must be a whole number from 0 to"),
         ({"temperature": 0.0}, "temperature must be positive"),
         ({"effective_share": 1.0}, "effective_share"),
     ],
