@@ -34,7 +34,7 @@ class HybridScene:
         state: last steps of one scene.
         model: MuJoCo model.
         data: its state at the newest step of ``state``; :meth:`step` advances it. Set ``data.ctrl`` in between.
-        bodies: name of a body in ``model`` -> its particles, moving ones.
+        bodies: name of a body in ``model`` -> its particles, moving ones: a Selection or its ``which``.
         fps: steps a second of the simulator.
         plan: of the effects, without sleep. Default: that of ``simulator.plan``.
 
@@ -44,7 +44,7 @@ class HybridScene:
 
     Raises:
         InputError: ``state`` has several scenes, a body does not exist or has no moving particles, two bodies share
-            some, ``1 / fps`` is not a multiple of MuJoCo's time step, or ``data`` is of another model.
+            some, the plan has sleep, ``1 / fps`` is not a multiple of MuJoCo's time step, or ``data`` is of another model.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class HybridScene:
         state: Particles,
         model: mujoco.MjModel,
         data: mujoco.MjData,
-        bodies: Mapping[str, Selection],
+        bodies: Mapping[str, Selection | str],
         *,
         fps: float,
         plan: Plan | None = None,
@@ -65,19 +65,22 @@ class HybridScene:
             raise InputError(f"1 / fps must be a multiple of the time step {model.opt.timestep:g} s; got fps {fps:g}")
         if len(newest_clouds(state.clouds)) != 1:
             raise InputError("state must have one scene")
+        self.plan = plan or simulator.plan()
+        if self.plan.spec.dynamics.sleep is not None or simulator.config.dynamics.steps_per_call > 1:
+            raise InputError("plan: driven particles need one without dynamics.sleep, and a model with one step a call")
         known = [model.body(number).name for number in range(model.nbody)]
         actor = torch.full_like(state.activity, -1, dtype=torch.int64)
         for number, (name, selection) in enumerate(bodies.items()):
             if name not in known:
                 raise InputError(f"bodies: MuJoCo's model has no body {name!r}; it has {', '.join(known)}")
-            chosen = selection.mask(state)
+            chosen = (Selection(selection) if isinstance(selection, str) else selection).mask(state)
             if bool((state.activity[chosen] != DYNAMIC).any()):
                 raise InputError(f"bodies: particles of {name} are frozen; select moving ones")
             if bool((actor[chosen] >= 0).any()):
                 raise InputError(f"bodies: {name} shares particles with another body")
             actor = torch.where(chosen, number, actor)
         load_mujoco().mj_kinematics(model, data)  # where bodies are, also in data that no step has computed
-        self.simulator, self.model, self.data, self.plan = simulator, model, data, plan or simulator.plan()
+        self.simulator, self.model, self.data = simulator, model, data
         self.state, self._bodies = dataclasses.replace(state, actor=actor), [known.index(name) for name in bodies]
 
     @torch.no_grad()

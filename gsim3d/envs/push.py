@@ -6,8 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsim3d.envs.scenes import FPS, N_PARTICLES, Scenes, TrueScene, polar
+from gsim3d.envs.scenes import FPS, N_PARTICLES, Scenes, TrueScene, TrueScenes, polar
 from gsim3d.envs.tasks import TaskEnv
+from gsim3d.errors import InputError
 from gsim3d.synth import pushing
 from gsim3d.synth.embedding import RigidFrame
 from gsim3d.synth.scene_setup import Pusher
@@ -84,6 +85,8 @@ class _Push(TaskEnv):
     @property
     def simulation(self) -> pushing.PushSimulation:
         """The simulation of ``backend="truth"``."""
+        if not isinstance(self.scenes, TrueScenes) or self.scenes.all[0] is None:
+            raise InputError('simulation: there is one after reset, with backend="truth"')
         return self.scenes.all[0].simulation
 
     @classmethod

@@ -2,7 +2,6 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from numbers import Integral
 from typing import Any, ClassVar
 
 import gymnasium
@@ -17,7 +16,7 @@ from torch import Tensor
 from gsim3d import pretrained
 from gsim3d.envs.model import ModelScenes
 from gsim3d.envs.scenes import FPS, N_PARTICLES, N_VIEWS, Scenes, TrueScene, TrueScenes, task_rig
-from gsim3d.errors import InputError, check_one_of
+from gsim3d.errors import InputError, check_one_of, check_whole, did_you_mean
 from gsim3d.io.files import shown
 from gsim3d.simulator import Simulator
 
@@ -150,12 +149,15 @@ class Episodes:
         backend: str = "truth",
         model: str | None = None,
         device: str = "cpu",
+        **unknown: Any,
     ):
+        for name in unknown:
+            options = "observation", "image_size", "render_mode", "backend", "model", "device"
+            raise InputError(f"{task.__name__} has no option {name!r}{did_you_mean(name, options)}")
         check_one_of("observation", observation, OBSERVATIONS)
         check_one_of("backend", backend, BACKENDS)
         check_one_of("render_mode", render_mode or RENDER_MODES[0], RENDER_MODES)
-        if not isinstance(image_size, Integral) or image_size < 1:
-            raise InputError(f"image_size must be a whole number of at least 1; got {image_size!r}")
+        check_whole("image_size", image_size)
         self.task, self.count, self.observation, self.rig = task, count, observation, task_rig(image_size)
         if backend == "model":
             if model is None and task.shipped not in pretrained.names():
@@ -195,8 +197,10 @@ class Episodes:
         self._measure()
 
     def numbers(self, actions: Any) -> Tensor:
-        """``actions`` of any kind as float64. Raises InputError if they are no numbers."""
+        """``actions`` of any kind as float64. Raises InputError if they are no real numbers."""
         try:
+            if torch.as_tensor(actions).is_complex():
+                raise TypeError
             return torch.as_tensor(actions, dtype=torch.float64, device=self.scenes.device)
         except (TypeError, ValueError, RuntimeError):
             raise InputError(f"action must be {len(self._high)} numbers; got {shown(actions)}") from None
@@ -271,9 +275,9 @@ class TaskVectorEnv(VectorEnv):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **options,
     ):
-        for name, value in (("num_envs", num_envs), ("max_episode_steps", max_episode_steps)):
-            if value is not None and (not isinstance(value, Integral) or value < 1):
-                raise InputError(f"{name} must be a whole number of at least 1; got {value!r}")
+        check_whole("num_envs", num_envs)
+        if max_episode_steps is not None:
+            check_whole("max_episode_steps", max_episode_steps)
         mode = getattr(autoreset_mode, "value", autoreset_mode)
         check_one_of("autoreset_mode", mode, [known.value for known in AutoresetMode])
         self._episodes = Episodes(self.task, num_envs, **options)
@@ -291,7 +295,12 @@ class TaskVectorEnv(VectorEnv):
     @property
     def np_random(self) -> tuple[np.random.Generator, ...]:
         """Random generators of the environments."""
-        return tuple(self._generator(number) for number in range(self.num_envs))
+        return tuple(self._generator(number)[0] for number in range(self.num_envs))
+
+    @property
+    def np_random_seed(self) -> tuple[int, ...]:
+        """Seeds of ``np_random``."""
+        return tuple(self._generator(number)[1] for number in range(self.num_envs))
 
     def reset(self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None):
         """The first observations of new episodes, and infos.
@@ -301,19 +310,20 @@ class TaskVectorEnv(VectorEnv):
             options: "reset_mask", bool [n]: environments to reset. Default: all.
 
         Raises:
-            InputError: seeds or mask have a wrong length, or the first reset is not of all environments.
+            InputError: seeds or mask are of a wrong kind or length, or the first reset is not of all environments.
         """
         seed = np.asarray(seed).tolist()  # of an array, too, Python's integers
         if not isinstance(seed, list):
-            seed = [seed if seed is None else seed + i for i in range(self.num_envs)]
+            seed = [seed + i if isinstance(seed, int) else seed for i in range(self.num_envs)]
         chosen = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, bool)))
         if len(seed) != self.num_envs or chosen.shape != (self.num_envs,) or chosen.dtype != bool:
             raise InputError(f"seed and reset_mask must be of {self.num_envs} environments")
         if self._episodes.executed is None and not chosen.all():
             raise InputError("reset_mask: the first reset must be of all environments")
-        for number in chosen.nonzero()[0].tolist():
-            if seed[number] is not None:
-                self._rngs[number] = seeding.np_random(seed[number])[0]
+        seeded = {number: seed[number] for number in chosen.nonzero()[0].tolist() if seed[number] is not None}
+        for number, value in seeded.items():
+            check_whole(f"seed of environment {number}", value, 0)
+        self._rngs |= {number: seeding.np_random(value) for number, value in seeded.items()}
         self._begin(chosen)
         return self._given(self._episodes.observe()), self._given(self._infos(self._episodes.info(), chosen))
 
@@ -354,14 +364,15 @@ class TaskVectorEnv(VectorEnv):
         """uint8 [H, W, 3] of the first camera of each environment; None without a render mode."""
         return None if self.render_mode is None else tuple(self._episodes.pictures())
 
-    def _generator(self, number: int) -> np.random.Generator:
+    def _generator(self, number: int) -> tuple[np.random.Generator, int]:
+        """Random generator of an environment, and its seed."""
         if number not in self._rngs:
-            self._rngs[number] = seeding.np_random()[0]
+            self._rngs[number] = seeding.np_random()
         return self._rngs[number]
 
     def _begin(self, chosen: np.ndarray) -> None:
         if chosen.any():
-            self._episodes.begin({number: self._generator(number) for number in chosen.nonzero()[0].tolist()})
+            self._episodes.begin({number: self._generator(number)[0] for number in chosen.nonzero()[0].tolist()})
         self._steps[chosen] = 0
         self._over = self._over & ~chosen
 

@@ -7,6 +7,7 @@ import io
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -53,19 +54,18 @@ def read_pieces(path: Path) -> list[Piece]:
 
 def texture_lookup(image: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     """Bilinear, repeating texture lookup; v starts at the bottom row, as in OBJ files."""
-    texels = image.astype(np.float64) / 255
+    return partial(_looked_up, image.astype(np.float64) / 255)
+
+
+def _looked_up(texels: np.ndarray, uv: np.ndarray) -> np.ndarray:
     height, width = texels.shape[:2]
-
-    def paint(uv):
-        x = (uv[:, 0] % 1) * width - 0.5
-        y = (1 - uv[:, 1] % 1) * height - 0.5
-        x0, y0 = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
-        fx, fy = (x - x0)[:, None], (y - y0)[:, None]
-        top = texels[y0 % height, x0 % width] * (1 - fx) + texels[y0 % height, (x0 + 1) % width] * fx
-        low = texels[(y0 + 1) % height, x0 % width] * (1 - fx) + texels[(y0 + 1) % height, (x0 + 1) % width] * fx
-        return top * (1 - fy) + low * fy
-
-    return paint
+    x = (uv[:, 0] % 1) * width - 0.5
+    y = (1 - uv[:, 1] % 1) * height - 0.5
+    x0, y0 = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    fx, fy = (x - x0)[:, None], (y - y0)[:, None]
+    top = texels[y0 % height, x0 % width] * (1 - fx) + texels[y0 % height, (x0 + 1) % width] * fx
+    low = texels[(y0 + 1) % height, x0 % width] * (1 - fx) + texels[(y0 + 1) % height, (x0 + 1) % width] * fx
+    return top * (1 - fy) + low * fy
 
 
 def joined_paint(pieces: list[Piece]) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:

@@ -1,6 +1,7 @@
 """Simulation of rigid bodies on a ground with a kinematic spherical pusher, by MuJoCo."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -9,7 +10,7 @@ from gsim3d.synth import meshes, render
 from gsim3d.synth.bodies import name_rng, named_body, named_contact
 from gsim3d.synth.mujoco_engine import body_nodes, check_solver, load_mujoco, model_xml
 from gsim3d.synth.scene_setup import Pusher, RigidBody, SceneSetup, turn_about_z
-from gsim3d.synth.shapes import icosphere
+from gsim3d.synth.shapes import icosphere, plain
 from gsim3d.synth.world import SceneBody
 
 OBJECTS = ("box", "cylinder", "capsule", "spot")  # bodies that do not roll away
@@ -47,7 +48,7 @@ def balls(count: int, color: tuple[float, float, float], level: int = 1) -> rend
     """Surface of ``count`` spheres of :func:`gsim3d.synth.shapes.icosphere`, one after the other."""
     points, faces = icosphere(level)
     faces = np.concatenate([faces + len(points) * number for number in range(count)])
-    return render.Surface(faces, np.tile(points, (count, 1))[faces], lambda p: np.broadcast_to(color, p.shape))
+    return render.Surface(faces, np.tile(points, (count, 1))[faces], partial(plain, color=color))
 
 
 def pusher_surface() -> tuple[render.Surface, np.ndarray]:

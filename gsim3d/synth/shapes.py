@@ -4,8 +4,9 @@ The bounding box of a body is centred at the origin, and the body fits a sphere 
 """
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -180,12 +181,11 @@ def _patches(p, colors):
     return colors[np.digitize(wave, [-0.6, 0.6])]
 
 
-PATTERNS = {
-    "checker": lambda p, colors: colors[np.floor(p * 5 + 0.5).astype(np.int64).sum(1) % 2],
-    "dots": _dots,
-    "patches": _patches,
-    "stripes": _stripes,
-}
+def _checker(p, colors):
+    return colors[np.floor(p * 5 + 0.5).astype(np.int64).sum(1) % 2]
+
+
+PATTERNS = {"checker": _checker, "dots": _dots, "patches": _patches, "stripes": _stripes}
 
 
 def normalise(vertices: np.ndarray) -> tuple[np.ndarray, float]:
@@ -209,4 +209,9 @@ def random_paint(rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]
     """Random pattern of three colours, as a function from points [N, 3] of a unit body to colours [N, 3]."""
     pattern = PATTERNS[sorted(PATTERNS)[rng.integers(len(PATTERNS))]]
     colors = PALETTE[rng.permutation(len(PALETTE))[:3]]
-    return lambda points: pattern(points, colors)
+    return partial(pattern, colors=colors)
+
+
+def plain(points: np.ndarray, color: Sequence[float]) -> np.ndarray:
+    """Colours of ``points`` [N, 3]: ``color`` [3] everywhere."""
+    return np.broadcast_to(color, points.shape)

@@ -9,6 +9,7 @@ import zlib
 from abc import ABC, abstractmethod
 from collections import Counter
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -305,7 +306,7 @@ class World(ABC):
         part = np.arange(n) / (n - 1) - 0.5
         points = np.stack(np.meshgrid(part, part, [0.0], indexing="ij"), -1).reshape(-1, 3)
         faces = grid_faces(n)
-        paint = (lambda p: np.broadcast_to(CLOTH_COLOR, p.shape)) if self.by_name else shapes.random_paint(rng)
+        paint = partial(shapes.plain, color=CLOTH_COLOR) if self.by_name else shapes.random_paint(rng)
         return render.Surface(faces, points[faces], paint, two_sided=True)
 
     def _with_actors(self, drawn: SceneDraw, rng: np.random.Generator) -> SceneDraw:

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from gsim3d.effects.selection import Selection
+from gsim3d.effects.spec import DynamicsEffects, EffectsSpec, Sleep
 from gsim3d.errors import InputError, NumericalError
 from gsim3d.priors import InertiaConfig
 from gsim3d.state import DYNAMIC, last_steps
@@ -25,7 +26,7 @@ XML = """<mujoco><option timestep="0.01" gravity="0 0 0"/><worldbody><body name=
   <actuator><velocity joint="shoulder" kv="1"/></actuator></mujoco>"""
 
 
-def make(bodies=None, fps=10.0, frames=None):
+def make(bodies=None, fps=10.0, frames=None, sleep=None):
     priors = dataclasses.replace(CONFIG.dynamics, priors=(InertiaConfig(),))
     simulator = awake(make_simulator(dataclasses.replace(CONFIG, dynamics=priors)))
     with torch.no_grad():
@@ -36,7 +37,13 @@ def make(bodies=None, fps=10.0, frames=None):
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     bodies = {"arm": ActorRows(number=0), "hand": ActorRows(number=1)} if bodies is None else bodies
-    return HybridScene(simulator, state, model, data, bodies, fps=fps)
+    plan = simulator.plan(EffectsSpec(DynamicsEffects(sleep=sleep)))
+    return HybridScene(simulator, state, model, data, bodies, fps=fps, plan=plan)
+
+
+def test_names_of_selections_are_taken():
+    scene = make({"arm": "moving"})
+    assert ((scene.state.actor == 0) == (scene.state.activity == DYNAMIC)).all()
 
 
 def test_particles_keep_their_places_in_the_frames_of_their_bodies():
@@ -81,6 +88,7 @@ def test_other_particles_see_the_bodies():
         ({"bodies": {"arm": Selection(), "hand": ActorRows(number=1)}}, "hand shares particles"),
         ({"bodies": {"arm": Selection("moving", ((9, 9, 9), (9, 9, 9)))}}, "the selection is empty"),
         ({"bodies": {"arm": Selection("frozen")}}, "particles of arm are frozen"),
+        ({"sleep": Sleep()}, "plan: driven particles need one without dynamics.sleep"),
         ({"fps": 15.0}, "multiple of the time step"),
         ({"fps": 0.0}, "multiple of the time step 0.01 s; got fps 0"),
         ({"fps": math.nan}, "got fps nan"),

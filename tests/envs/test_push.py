@@ -1,6 +1,7 @@
 """Push environments: Gymnasium's own checks, bits by seed, exact actors, and a planner that solves the task."""
 
 import copy
+import pickle
 import subprocess
 import sys
 import warnings
@@ -63,6 +64,15 @@ def test_a_copy_of_an_episode_goes_on_by_itself():
     ends = [env.step(np.array([0.4, speed]))[0]["pusher"] for env, speed in ((task, 0.1), (other, 0.1), (other, -0.3))]
     assert np.array_equal(ends[0], ends[1]) and not np.array_equal(ends[1], ends[2])
     assert np.array_equal(task.simulation.pusher[:2].astype(np.float32), ends[0])
+
+
+@pytest.mark.parametrize("name, seed", [("PushToGoal", 0), ("PushClear", 1), ("ThrowToTarget", 0), ("ClothCover", 0)])
+def test_a_pickled_episode_goes_on_by_itself(name, seed):  # PushClear's has a textured body
+    task = make(name, observation="both", image_size=24).unwrapped
+    task.reset(seed=seed)
+    other, action = pickle.loads(pickle.dumps(task)), np.full(task.action_space.shape, 0.3, np.float32)
+    ends = [env.step(action)[0] for env in (task, other)]
+    assert all(np.array_equal(ends[0][part], ends[1][part]) for part in ends[0])
 
 
 def test_pusher_moves_exactly_as_commanded_and_moves_the_body():
@@ -131,13 +141,15 @@ def test_a_cleared_region_is_solved():
     assert PushClear.solved(PushClear.distances(task.scenes, goals))
 
 
-@pytest.mark.parametrize("action", [np.zeros(3), [np.nan, 0], np.array([2 * MAX_SPEED, 0]), "left", None, [[0], 0]])
+@pytest.mark.parametrize("action", [np.zeros(3), [np.nan, 0], np.array([2 * MAX_SPEED, 0]), "left", None, [[0], 0], [1j, 0]])
 def test_wrong_actions_are_refused(action):
     task = PushToGoal()
     with pytest.raises(InputError, match="step was called before reset"):
         task.step(np.zeros(2))
     with pytest.raises(InputError, match="render was called before reset"):
         PushToGoal(render_mode="rgb_array").render()
+    with pytest.raises(InputError, match="simulation: there is one after reset"):
+        _ = task.simulation
     task.reset(seed=0)
     with pytest.raises(InputError, match="action must be 2 numbers"):
         task.step(action)
@@ -147,6 +159,8 @@ def test_wrong_actions_are_refused(action):
 def test_wrong_options_are_refused(options):
     with pytest.raises(InputError, match=next(iter(options))):
         PushToGoal(**options)
+    with pytest.raises(InputError, match="PushToGoal has no option 'modle'; did you mean model?"):
+        gymnasium.make_vec("gsim3d/PushToGoal-v0", num_envs=2, modle="push")
 
 
 def test_vector_environments_of_gymnasium_take_scenes_with_different_numbers_of_bodies():
@@ -163,6 +177,7 @@ def test_vector_environments_of_gymnasium_take_scenes_with_different_numbers_of_
     [
         ({"num_envs": 0}, "num_envs must be a whole number of at least 1"),
         ({"num_envs": 1.5}, "num_envs must be a whole number of at least 1"),
+        ({"num_envs": True}, "num_envs must be a whole number of at least 1; got True"),
         ({"max_episode_steps": 0}, "max_episode_steps must be a whole number of at least 1"),
         ({"autoreset_mode": "Never"}, "autoreset_mode must be one of NextStep, SameStep, Disabled; got 'Never'"),
     ],
@@ -176,6 +191,12 @@ def test_seeds_may_be_an_array_and_actions_stay_as_they_are():
     envs = gymnasium.make_vec("gsim3d/ThrowToTarget-v0", num_envs=2)
     first = envs.reset(seed=np.array([3, 4]))[0]
     assert np.array_equal(first["particles"], envs.reset(seed=3)[0]["particles"])
+    envs.reset(seed=[7, None])
+    assert envs.np_random_seed == (7, 4)
+    for wrong in ("a", -1, 1.5, [5, "a"]):
+        with pytest.raises(InputError, match="seed of environment [01] must be a whole number of at least 0"):
+            envs.reset(seed=wrong)
+    assert envs.np_random_seed == (7, 4)
     given = np.full((2, 3), 0.5)
     for _ in range(3):
         envs.step(given)
