@@ -265,10 +265,10 @@ class Actions(TensorRecord):
         """
         if isinstance(types, str):
             raise InputError(f"actions: types must be a list, one name for each point; got {types!r}")
-        wanted = positions.dim() == 4 and positions.shape[1] > 0 and positions.shape[2:] == (len(types), 3)
+        wanted = positions.dim() == 4 and 0 not in positions.shape[1:] and positions.shape[2:] == (len(types), 3)
         if not wanted or not positions.is_floating_point():
             got = f"{positions.dtype} {list(positions.shape)}"
-            raise InputError(f"actions: positions must be float [B, T, {len(types)}, 3]; got {got}")
+            raise InputError(f"actions: positions must be float [B, T, {len(types) or 'A > 0'}, 3]; got {got}")
         finite = positions.detach().isfinite().flatten(2).all(2)
         if not bool(finite.all()):
             scene, step = (~finite).nonzero()[0].tolist()

@@ -44,6 +44,18 @@ def read_actions(folder: Path, n_steps: int, problems: Problems) -> RecordedActi
     return RecordedActions(positions.astype(np.float64), tuple(map(str, types)), np.ones(positions.shape[:2], bool))
 
 
+def check_places(actions: RecordedActions, bounds: np.ndarray, problems: Problems) -> None:
+    """Reports points that are always far from ``bounds`` [2, 3] in metres, or move by more than these in a step."""
+    size, paths = bounds[1] - bounds[0], np.where(actions.present[..., None], actions.positions, np.nan)
+    if not (np.abs(paths - bounds.mean(0)) <= size).all(-1).any():
+        problems.add("actors: all points are far from the bounds of the scene; give metres, in the cameras' world")
+    moved = np.linalg.norm(np.diff(paths, axis=0), axis=-1)
+    for step, point in np.argwhere(moved > np.linalg.norm(size))[:1]:
+        problems.add(
+            f"actors: point {point} moves by {moved[step, point]:.3g} m, more than the scene, to frame {step + 1}"
+        )
+
+
 def _arrays(content: bytes) -> tuple[np.ndarray, np.ndarray]:
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         for entry in archive.infolist():

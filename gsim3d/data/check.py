@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from gsim3d.data import layouts
+from gsim3d.data.actions import check_places
 from gsim3d.data.cameras import check_directions, positions_and_axes, project
 from gsim3d.data.recording import MOVING, Problems, Recording, evenly_spaced
 from gsim3d.data.scene import Scene
@@ -47,6 +48,8 @@ def check_scene(folder: str | Path, quiet: bool = True) -> SceneCheck:
         if not problems.found:
             check_directions(recording, problems)
         scene = Scene(path, recording)
+        if scene.has_actions():
+            check_places(scene.recording.actions, scene.bounds, problems)
     except InputError as error:
         problems.add(str(error))
     if recording is not None:

@@ -12,7 +12,7 @@ from gsim3d.synth.embedding import ClothGrid, grid_faces
 from gsim3d.synth.mujoco_engine import CLOTH_RADIUS, CONTACT_TIME, POISSON, check_solver, load_mujoco
 from gsim3d.synth.pushing import balls
 from gsim3d.synth.render import Surface
-from gsim3d.synth.shapes import icosphere, plain
+from gsim3d.synth.shapes import icosphere
 from gsim3d.synth.world import CLOTH_COLOR, CLOTH_REFINEMENT
 
 MAX_SPEED = 0.5  # m/s of each gripper along each axis
@@ -46,7 +46,7 @@ class ClothScene(TrueScene):
         self._fine, self._sphere = flat.refine(CLOTH_REFINEMENT), GRIPPER_RADIUS * icosphere(1)[0]
         faces = grid_faces((COUNT - 1) * CLOTH_REFINEMENT + 1)
         corners = np.zeros((*faces.shape, 3))
-        sheet = Surface(faces, corners, partial(plain, color=CLOTH_COLOR), two_sided=True)
+        sheet = Surface(faces, corners, partial(np.full_like, fill_value=CLOTH_COLOR), two_sided=True)
         super().__init__(goal, [sheet, gripper, gripper], 1)
         self._model, self._data = _start(angle)
         self._data.qpos[:] = _settled()

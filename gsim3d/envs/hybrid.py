@@ -44,7 +44,7 @@ class HybridScene:
 
     Raises:
         InputError: ``state`` has several scenes, a body does not exist or has no moving particles, two bodies share
-            some, the plan has sleep, ``1 / fps`` is not a multiple of MuJoCo's time step, or ``data`` is of another model.
+            some, the plan has sleep, ``1 / fps`` is no multiple of MuJoCo's time step, or ``data`` is of another model.
     """
 
     def __init__(

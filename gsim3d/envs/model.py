@@ -97,10 +97,8 @@ class ModelScenes(Scenes):
         sizes = set(inputs.image_size) or {image_size}
         if len(sizes) > 1:
             raise InputError(f"model has images of {inputs.image_size} pixels; environments have square ones")
-        effects = simulator.effects
-        self.plan = simulator.plan(
-            dataclasses.replace(effects, dynamics=dataclasses.replace(effects.dynamics, sleep=None))
-        )
+        awake = dataclasses.replace(simulator.effects.dynamics, sleep=None)
+        self.plan = simulator.plan(dataclasses.replace(simulator.effects, dynamics=awake))
         self.simulator, self.count, self.most_bodies = simulator, count, most_bodies
         self.inputs, self.history = inputs, inputs.history or self.plan.history
         self.rig = task_rig(sizes.pop(), inputs.context_views)

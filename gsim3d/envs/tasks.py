@@ -84,8 +84,8 @@ class TaskEnv(gymnasium.Env):
             InputError: ``action`` is not inside the bounds, or no episode has begun.
         """
         self._episodes.act(self._episodes.numbers(action)[None])
-        info = self._info()
-        return self._observe(), -float(self._episodes.distances[0]), bool(self._episodes.ended[0]), False, info
+        reward, terminated = -float(self._episodes.distances[0]), bool(self._episodes.ended[0])
+        return self._observe(), reward, terminated, False, self._info()
 
     def render(self) -> np.ndarray | None:
         """uint8 [H, W, 3] of the first camera; None without a render mode."""
@@ -245,8 +245,7 @@ class Episodes:
 
     def info(self) -> dict[str, Tensor]:
         """Facts [n, ...]; the centers of bodies that a scene does not have are infinite: NaN would not equal itself."""
-        centers = self.scenes.centers()[..., :2]
-        centers = torch.where(centers.isnan(), torch.inf, centers)
+        centers = self.scenes.centers()[..., :2].nan_to_num(torch.inf, torch.inf, -torch.inf)
         return {"is_success": self.solved, "centers": centers, "velocity": self.executed.clone()}
 
 
@@ -276,8 +275,7 @@ class TaskVectorEnv(VectorEnv):
         **options,
     ):
         check_whole("num_envs", num_envs)
-        if max_episode_steps is not None:
-            check_whole("max_episode_steps", max_episode_steps)
+        check_whole("max_episode_steps", 1 if max_episode_steps is None else max_episode_steps)
         mode = getattr(autoreset_mode, "value", autoreset_mode)
         check_one_of("autoreset_mode", mode, [known.value for known in AutoresetMode])
         self._episodes = Episodes(self.task, num_envs, **options)
@@ -351,13 +349,12 @@ class TaskVectorEnv(VectorEnv):
         late = self._steps >= (np.inf if self._most_steps is None else self._most_steps)
         truncated = torch.from_numpy(late).to(self.scenes.device)
         self._over = late | terminated.cpu().numpy()
-        infos = self._infos(episodes.info(), np.ones(self.num_envs, bool))
-        observed = episodes.observe()
+        infos, observed = {}, episodes.observe()
         if self.mode is AutoresetMode.SAME_STEP and self._over.any():
-            infos = self._final(observed, infos)
+            infos = self._final(observed)
             self._begin(self._over)
-            infos |= self._infos(episodes.info(), np.ones(self.num_envs, bool))
             observed = episodes.observe()
+        infos |= self._infos(episodes.info(), np.ones(self.num_envs, bool))
         return tuple(self._given(value) for value in (observed, rewards, terminated, truncated, infos))
 
     def render(self) -> tuple[np.ndarray, ...] | None:
@@ -365,7 +362,6 @@ class TaskVectorEnv(VectorEnv):
         return None if self.render_mode is None else tuple(self._episodes.pictures())
 
     def _generator(self, number: int) -> tuple[np.random.Generator, int]:
-        """Random generator of an environment, and its seed."""
         if number not in self._rngs:
             self._rngs[number] = seeding.np_random()
         return self._rngs[number]
@@ -376,13 +372,13 @@ class TaskVectorEnv(VectorEnv):
         self._steps[chosen] = 0
         self._over = self._over & ~chosen
 
-    def _final(self, observed: dict[str, Tensor], infos: dict[str, Any]) -> dict[str, Any]:
+    def _final(self, observed: dict[str, Tensor]) -> dict[str, Any]:
         """Infos with the last observations and infos of the episodes that have ended."""
         final = np.full(self.num_envs, None, dtype=object)
         for number in self._over.nonzero()[0].tolist():
             final[number] = {name: value[number] for name, value in observed.items()}
         found = {"final_obs": final, "final_info": self._infos(self._episodes.info(), self._over)}
-        return {**infos, **self._infos(found, self._over)}
+        return self._infos(found, self._over)
 
     def _given(self, value: Any) -> Any:
         """``value``, nested in dictionaries and arrays of objects, with arrays instead of tensors for the truth."""

@@ -93,10 +93,8 @@ class ThrowToTarget(TaskEnv):
         at = polar(rng, START)
         body = pushing.draw_body(name, at, rng.uniform(0, 2 * np.pi))
         up = np.array([0.0, 0.0, rng.uniform(*HEIGHT)])
-        parts = tuple(part + up for part in body.body.parts)
-        raised = dataclasses.replace(
-            body, body=dataclasses.replace(body.body, parts=parts), vertices=body.vertices + up
-        )
+        lifted = dataclasses.replace(body.body, parts=tuple(part + up for part in body.body.parts))
+        raised = dataclasses.replace(body, body=lifted, vertices=body.vertices + up)
         return ThrowScene(raised, at + polar(rng, GOAL_DISTANCE))
 
     @classmethod

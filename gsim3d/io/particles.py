@@ -6,7 +6,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import safetensors
-import torch
 from safetensors.torch import load_file, save
 from torch import Tensor
 
@@ -85,9 +84,4 @@ def _actions(about: dict, tensors: dict[str, Tensor]) -> Actions | None:
     names, first = tuple(map(str, names)), tuple(map(int, first))
     if types.dim() == 2:  # written when points were there at all steps
         types = types[:, None].expand(-1, positions.shape[1], -1)
-    fits = types.dim() == 3 and positions.shape == (1, *types.shape[1:], 3) and positions.numel() > 0
-    if not fits or not bool(positions.isfinite().all()) or len(first) > 1:
-        raise ValueError("positions of actions are damaged")
-    if types.dtype != torch.int64 or not bool(((types >= -1) & (types < len(names))).all()):
-        raise ValueError("types of actions are damaged")
     return Actions(positions, types, names, first)

@@ -180,13 +180,22 @@ def check_particles(particles: Particles, where: str, dtype: torch.dtype, widths
 
 
 def _check_actions(particles: Particles, where: str) -> None:
-    positions, types = particles.actions.positions, particles.actions.types
-    n_scenes, device = len(particles.origin), particles.means.device
-    fits = positions.shape == (n_scenes, *types.shape[1:], 3) and types.dim() == 3 and len(types) == n_scenes
+    actions, n_scenes, device = particles.actions, len(particles.origin), particles.means.device
+    positions, types, first = actions.positions, actions.types, actions.first or (0,) * n_scenes
+    fits = types.dim() == 3 and positions.shape == (*types.shape, 3) and len(types) == len(first) == n_scenes
+    fits = fits and 0 not in types.shape and positions.is_floating_point() and types.dtype == torch.int64
     if not fits or {positions.device, types.device} != {device}:
-        got = f"{list(positions.shape)} and {list(types.shape)} on {positions.device}"
-        wanted = f"positions [{n_scenes}, T, A, 3] and types [{n_scenes}, T, A] on {device}"
+        got = f"{list(positions.shape)} {positions.dtype} and {list(types.shape)} {types.dtype} on {positions.device}"
+        wanted = f"float positions [{n_scenes}, T, A, 3] and int64 types [{n_scenes}, T, A] on {device}, T and A > 0"
         raise InputError(f"{where}: particles.actions must have {wanted}; got {got}")
+    if device.type != "cpu" and (where != "rollout" or torch.cuda.is_current_stream_capturing()):
+        return  # the others are called once a step, and must not wait for the device
+    finite = positions.detach().isfinite().all(-1)
+    bad = ~finite | (types < -1) | (types >= len(actions.names))
+    if bool(bad.any()):
+        scene, entry, point = bad.nonzero()[0].tolist()
+        rule = "types must be indices of names, or -1" if finite[scene, entry, point] else "positions must be finite"
+        raise InputError(f"{where}: particles.actions: {rule}; scene {scene}, step {first[scene] + entry}")
 
 
 def _check_choices(particles: Particles, where: str) -> None:

@@ -88,8 +88,7 @@ class Planner(ABC):
             raise InputError("low and high must be vectors [A] of one length, floating dtype and device")
         if not low.isfinite().all() or not high.isfinite().all() or not (low < high).all():
             raise InputError("low and high must be finite, with low below high in every element")
-        real = isinstance(noise, Real) and isinstance(color, Real)
-        if not real or not (0 < noise < math.inf and 0 <= color < math.inf):
+        if not all(isinstance(x, Real) and 0 <= x < math.inf for x in (noise, color)) or noise == 0:
             raise InputError(f"noise must be positive and color 0 or more; got {noise!r} and {color!r}")
         self.dynamics, self.cost, self.low, self.high = dynamics, cost, low, high
         self.horizon, self.samples, self.iterations = horizon, samples, iterations
@@ -185,7 +184,7 @@ class CEM(Planner):
     Args:
         elite_share: share of the samples that the Gaussian is fitted to; at least two.
         momentum: share of the old mean and standard deviation that stays.
-        kept_share: share of the elites that take part in the next iteration, and in the next call, shifted.
+        kept_share: share of the elites that join the K samples of the next iteration, and of the next call, shifted.
         min_std: smallest standard deviation, as a share of ``high - low``.
         others: as for :class:`Planner`.
     """

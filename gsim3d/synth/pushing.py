@@ -10,7 +10,7 @@ from gsim3d.synth import meshes, render
 from gsim3d.synth.bodies import name_rng, named_body, named_contact
 from gsim3d.synth.mujoco_engine import body_nodes, check_solver, load_mujoco, model_xml
 from gsim3d.synth.scene_setup import Pusher, RigidBody, SceneSetup, turn_about_z
-from gsim3d.synth.shapes import icosphere, plain
+from gsim3d.synth.shapes import icosphere
 from gsim3d.synth.world import SceneBody
 
 OBJECTS = ("box", "cylinder", "capsule", "spot")  # bodies that do not roll away
@@ -34,10 +34,8 @@ def draw_body(
     offset = np.array([*position, -collision[:, 2].min()])
     vertices, collision = vertices + offset, collision + offset
     mass = DENSITY * float(np.prod(np.ptp(collision, axis=0)))
-    if rng is None:
-        friction, bounce = named_contact(name, FRICTION, BOUNCE)
-    else:
-        friction, bounce = rng.uniform(*FRICTION), rng.uniform(*BOUNCE)
+    ranges = FRICTION, BOUNCE
+    friction, bounce = named_contact(name, *ranges) if rng is None else (rng.uniform(*one) for one in ranges)
     parts = tuple(meshes.convex_pieces(collision, body.collision_faces))
     rigid = RigidBody(parts, np.zeros(3), np.zeros(3), mass, friction, bounce)
     facts = {"object": name, "mass": round(mass, 6), "size": size, "friction": friction, "bounce": bounce}
@@ -48,7 +46,7 @@ def balls(count: int, color: tuple[float, float, float], level: int = 1) -> rend
     """Surface of ``count`` spheres of :func:`gsim3d.synth.shapes.icosphere`, one after the other."""
     points, faces = icosphere(level)
     faces = np.concatenate([faces + len(points) * number for number in range(count)])
-    return render.Surface(faces, np.tile(points, (count, 1))[faces], partial(plain, color=color))
+    return render.Surface(faces, np.tile(points, (count, 1))[faces], partial(np.full_like, fill_value=color))
 
 
 def pusher_surface() -> tuple[render.Surface, np.ndarray]:

@@ -4,7 +4,7 @@ The bounding box of a body is centred at the origin, and the body fits a sphere 
 """
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -210,8 +210,3 @@ def random_paint(rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]
     pattern = PATTERNS[sorted(PATTERNS)[rng.integers(len(PATTERNS))]]
     colors = PALETTE[rng.permutation(len(PALETTE))[:3]]
     return partial(pattern, colors=colors)
-
-
-def plain(points: np.ndarray, color: Sequence[float]) -> np.ndarray:
-    """Colours of ``points`` [N, 3]: ``color`` [3] everywhere."""
-    return np.broadcast_to(color, points.shape)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from gsim3d.effects.spec import AppearanceEffects, DynamicsEffects, EffectsSpec, OutputEffects
-from gsim3d.errors import InputError, check_ranges, did_you_mean
+from gsim3d.errors import InputError, check_ranges, check_whole, did_you_mean
 from gsim3d.synth import cameras, render, scene_setup, shapes, writer
 from gsim3d.synth.bodies import OBJECTS, load_mesh, mesh_bytes, mesh_name
 from gsim3d.synth.embedding import Embedding, grid_faces, states
@@ -138,9 +138,7 @@ class World(ABC):
 
     def _check_counts(self, **least: int) -> None:
         for field, low in least.items():
-            value = getattr(self, field)
-            if not (isinstance(value, int) and low <= value <= MAX_COUNT):
-                raise InputError(f"{field} must be a whole number from {low} to {MAX_COUNT}; got {value!r}")
+            check_whole(field, getattr(self, field), low, MAX_COUNT)
 
     def _check_ranges(self, *fields: str) -> None:
         for field in fields:
@@ -306,7 +304,7 @@ class World(ABC):
         part = np.arange(n) / (n - 1) - 0.5
         points = np.stack(np.meshgrid(part, part, [0.0], indexing="ij"), -1).reshape(-1, 3)
         faces = grid_faces(n)
-        paint = partial(shapes.plain, color=CLOTH_COLOR) if self.by_name else shapes.random_paint(rng)
+        paint = partial(np.full_like, fill_value=CLOTH_COLOR) if self.by_name else shapes.random_paint(rng)
         return render.Surface(faces, points[faces], paint, two_sided=True)
 
     def _with_actors(self, drawn: SceneDraw, rng: np.random.Generator) -> SceneDraw:

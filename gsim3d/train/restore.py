@@ -109,6 +109,8 @@ class Restored:
             )
         if self.plan.spec.dynamics.actions and not scene.has_actions():
             changes.append("no actors, because the scene has no actions.npz")
+        if scene.has_actions() and not self.plan.spec.dynamics.actions:
+            changes.append("actors ignored, because the model was not trained with dynamics.actions")
         if scene.recording.subtract_background:
             changes.append(
                 'background subtracted and set to black (preserve it with "masks": "none" in cameras.json, or provide '

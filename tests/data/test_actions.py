@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import re
 import zipfile
 
 import numpy as np
@@ -103,6 +104,29 @@ def test_damaged_actions_are_refused(folder, arrays, words):
         Scene.open(folder)
     assert str(folder / FILE) in str(error.value)
     assert any(str(folder / FILE) in problem for problem in check_scene(folder).problems)
+
+
+@pytest.mark.parametrize(
+    "positions, words",
+    [
+        (POSITIONS, ()),
+        (
+            1000 * POSITIONS,
+            (
+                "all points are far from the bounds of the scene",
+                "point . moves by .* m, more than the scene, to frame 1",
+            ),
+        ),
+        (POSITIONS + np.float32(20), ("all points are far from the bounds of the scene",)),
+        (POSITIONS + np.float32([[[0]], [[0]], [[100]], [[0]]]), ("point . moves by 173 m, .* frame 2",)),
+    ],
+)
+def test_places_of_points_are_checked(folder, positions, words):
+    save(folder, positions=positions)
+    problems = check_scene(folder).problems
+    assert len(problems) == len(words)
+    for problem, wanted in zip(problems, words, strict=True):
+        assert re.search(f"actors: {wanted}", problem)
 
 
 def test_files_that_are_no_actions_are_refused(folder):

@@ -256,6 +256,22 @@ def test_wrong_actions_are_refused():
         Actions.of(positions, TYPES)
     with pytest.raises(InputError, match=r"rollout: particles.actions must .* .1, T, A, 3.*got .2, 4, 1, 3."):
         rollout(simulator, given(state, Actions.of(torch.zeros(2, 4, 1, 3), ("hand",))))
+    with pytest.raises(InputError, match=r"positions must be float .B, T, A > 0, 3.; got torch.float32 .1, 4, 0, 3."):
+        Actions.of(torch.zeros(1, 4, 0, 3), ())
+    late, types = actions.positions.clone(), actions.types.clone()
+    late[0, 3, 1, 0], types[0, 2, 1] = torch.nan, 2
+    for change, words in (
+        ({"positions": late, "first": (5,)}, "rollout: particles.actions: positions must be finite; scene 0, step 8"),
+        ({"types": types}, "types must be indices of names, or -1; scene 0, step 2"),
+        ({"types": types - 4}, "types must be indices of names, or -1; scene 0, step 0"),
+        (
+            {"types": types.float()},
+            r"int64 types .* on cpu.*got .1, 8, 2, 3. torch.float32 and .1, 8, 2. torch.float32",
+        ),
+        ({"positions": late[:, :, :0], "types": types[:, :, :0]}, "T and A > 0; got .1, 8, 0, 3."),
+    ):
+        with pytest.raises(InputError, match=words):
+            rollout(simulator, given(state, dataclasses.replace(actions, **change)))
     with pytest.raises(InputError, match="does not know the type .foot.; it has hand, pusher"):
         rollout(simulator, given(state, Actions.of(torch.zeros(1, 4, 1, 3), ("foot",))))
     for wrong in ({"actions": ("a", "a")}, {"actions": ("a",), "priors": (InertiaConfig(),)}):
@@ -288,7 +304,10 @@ def test_saved_states_keep_their_actions(tmp_path):
     assert_same_bits(again.positions, actions.positions) or assert_same_bits(again.types, actions.types)
     damaged = dataclasses.replace(actions, types=actions.types + 5)
     write_particles(tmp_path / "state.safetensors", given(state, damaged))
-    with pytest.raises(InputError, match="not a state, .* or a damaged one"):
+    with pytest.raises(
+        InputError,
+        match=r"state.safetensors: particles.actions: types must be indices of names, or -1; scene 0, step 5",
+    ):
         read_particles(tmp_path / "state.safetensors")
 
 

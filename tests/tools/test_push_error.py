@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from gsim3d.data import Scene
+from gsim3d.effects.spec import EffectsSpec
 from gsim3d.errors import FitWarning
 from gsim3d.synth import generate
 from gsim3d.train.config import DataConfig, PhaseConfig, TrainConfig
@@ -53,6 +54,9 @@ def test_errors_of_a_simulator_that_moves_nothing_are_those_of_constant(tmp_path
     shutil.copytree(folders[0], tmp_path / "silent" / "box", ignore=shutil.ignore_patterns("actions.npz"))
     with pytest.warns(FitWarning, match="no actors, because the scene has no actions.npz"):
         restored.open_scene(tmp_path / "silent" / "box")
+    plain = dataclasses.replace(restored, plan=restored.simulator.plan(EffectsSpec()))
+    with pytest.warns(FitWarning, match="actors ignored, because the model was not trained with dynamics.actions"):
+        plain.open_scene(folders[0])
     scene, moved = restored.open_scene(folders[0]), torch.tensor([0.3, 0.0, 0.0])
     roll = restored.simulator.rollout
 
