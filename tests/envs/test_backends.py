@@ -338,7 +338,7 @@ def test_benchmark_plans_in_a_model_from_images_of_the_truth(monkeypatch, capsys
     episode = bench.run("model", env, 1000, scenes=scenes, reach=0.5, chunk=2)
     assert episode["steps"] == 6 and len(episode["plan_seconds"]) == len(episode["errors"]) == 2
     assert np.array(episode["errors"]).shape == (2, 2, 8) and np.isfinite(episode["errors"]).all()
-    assert len(episode["encode_seconds"]) == 2 and episode["plan_steps"] == [8 * (3 + 1)] * 2  # and that of the mean
+    assert len(episode["encode_seconds"]) == 2 and episode["predicted_steps"] == 2 * 8 * (3 + 1)  # and the mean's
     found = bench.summary([episode, bench.run("zero", env, 1000)])
     bench.show("model", found)
     assert found["solved"] == 0 and len(found["median_errors"]["model"]) == 8
@@ -363,7 +363,7 @@ def test_benchmark_goes_on_from_its_file(monkeypatch, capsys, tmp_path, model):
     bench = importlib.import_module("push_planning")
     called, wanted = [], bench.run
     episode = {"solved": True, "distance": 0.1, "steps": 3, "plan_seconds": [1.0]}
-    episode |= {"encode_seconds": [0.5], "plan_steps": [100], "errors": [[[0.01] * 8] * 2]}
+    episode |= {"encode_seconds": [0.5], "predicted_steps": 100, "errors": [[[0.01] * 8] * 2]}
 
     def run(agent, env, seed, **options):
         called.append((agent, seed))
@@ -378,7 +378,8 @@ def test_benchmark_goes_on_from_its_file(monkeypatch, capsys, tmp_path, model):
     bench.main([*given, "--seeds", "2"])
     assert called == [("zero", 1000), ("zero", 1001), ("zero", 1002), ("model", 1000), ("model", 1001)]
     shown = capsys.readouterr().out
-    assert shown.count("solved 2 of 2 (95 %: 34% to 100%), last distance 0.100 m, 3 steps, 1.00 s a plan") == 2
+    ended = "solved 2 of 2 (95 %: 34% to 100%), last distance 0.100 m, 3 steps"
+    assert shown.count(f"{ended}, 0.50 s to encode, 1.00 s a plan, 100 steps") == 2
     monkeypatch.setattr(bench, "run", wanted)
     for wrong, words in ((["--reach", "1"], "is of other settings"), (["--seeds", "0"], "--seeds must be at least 1")):
         with pytest.raises(SystemExit):

@@ -55,11 +55,10 @@ def test_double_integrator_costs_at_most_five_percent_more_than_lqr(kind):
     )
 
 
-@pytest.mark.parametrize("options, most", [({"samples": 128, "iterations": 10}, 1.05), ({"iterations": 30}, 1.02)])
 @pytest.mark.parametrize("kind", ["mppi", "cem"])
-def test_settings_of_the_reference_reach_what_it_says(kind, options, most):
-    costs = [planner(kind, color=0.5, seed=seed, **options).plan(START).cost for seed in range(3)]
-    assert max(costs) <= most * lqr_cost()
+def test_settings_of_the_reference_reach_five_percent(kind):
+    agents = [planner(kind, color=0.5, samples=128, iterations=10, seed=seed) for seed in range(5)]
+    assert max(agent.plan(START).cost for agent in agents) <= 1.05 * lqr_cost()
 
 
 @pytest.mark.parametrize("kind", PLANNERS)

@@ -6,9 +6,8 @@ python tools/bench/push_planning.py [--agents zero random mppi cem model] [--mod
 Planners: K 64 sequences of H 8 actions, 3 iterations, replanned every 4 steps. Agent ``model`` is MPPI in the simulator
 ``--model``, which acts in MuJoCo: before each plan it encodes images of the last steps, with masks of the body and the
 pusher, and the pusher's positions. Printed: solved episodes with the 95 % Wilson interval, the median of the last
-distance to the goal, steps of solved episodes, seconds of a plan, predicted steps a second in it, and for ``model``
-seconds of encoding before each plan, and the median error of the body's center at each of the H steps of its plans,
-beside that of a body that does not move. Each action of ``random`` is held for 4 steps, so that the pusher gets away.
+distance to the goal, steps of solved episodes, seconds of encoding and of a plan, predicted steps a second, and for
+``model`` the median error of the body's center at each of the H steps of its plans, and that of a resting body.
 """
 
 import argparse
@@ -30,7 +29,7 @@ import gsim3d.envs  # noqa: E402, F401
 from gsim3d import Simulator  # noqa: E402
 from gsim3d.envs.model import ModelScenes, ModelState, Start  # noqa: E402
 from gsim3d.envs.push import MAX_SPEED, PushToGoal  # noqa: E402
-from gsim3d.envs.push_planning import GoalCost, ModelDynamics, PushStates, TrueDynamics  # noqa: E402
+from gsim3d.envs.push_planning import GoalCost, ModelDynamics, TrueDynamics  # noqa: E402
 from gsim3d.io.files import write_whole  # noqa: E402
 from gsim3d.io.terminal import progress  # noqa: E402
 from gsim3d.planning import CEM, MPPI, Plan  # noqa: E402
@@ -39,21 +38,6 @@ FIRST_SEED, FASTEST = 1000, torch.full((2,), MAX_SPEED, dtype=torch.float64)
 EVERY = 4  # steps between plans
 PLANNERS = {"mppi": MPPI, "cem": CEM, "model": MPPI}
 SETTINGS = {"horizon": 8, "samples": 64, "iterations": 3, "noise": 0.3}
-
-
-class Counted:
-    """Dynamics that count the steps that they predict.
-
-    Attributes:
-        steps: of all sequences since the start.
-    """
-
-    def __init__(self, dynamics: TrueDynamics | ModelDynamics):
-        self.dynamics, self.steps = dynamics, 0
-
-    def __call__(self, state: np.ndarray | ModelState, actions: torch.Tensor) -> PushStates:
-        self.steps += actions.shape[0] * actions.shape[1]
-        return self.dynamics(state, actions)
 
 
 class InModel:
@@ -66,7 +50,7 @@ class InModel:
     def __init__(self, task: PushToGoal, seed: int, scenes: ModelScenes, reach: float | None, chunk: int | None):
         self.task, self.scenes, self.seed, self.errors = task, scenes, seed, []
         self.dynamics, cost = ModelDynamics(scenes, reach), GoalCost(torch.from_numpy(task.goal).to(scenes.device))
-        self.planner = MPPI(Counted(self.dynamics), cost, -FASTEST, FASTEST, seed=seed, chunk=chunk, **SETTINGS)
+        self.planner = MPPI(self.dynamics, cost, -FASTEST, FASTEST, seed=seed, chunk=chunk, **SETTINGS)
         first = (task.scenes.all[0].view(scenes.rig), task.scenes.all[0].actors)
         self.seen = deque([first] * scenes.history, maxlen=scenes.history)  # at rest before the start
 
@@ -92,32 +76,29 @@ class InModel:
 
 
 def run(agent: str, env: gymnasium.Env, seed: int, **of_model) -> dict:
-    """One episode: whether it was solved, the last distance, steps, and of each plan: seconds of encoding and of the
-    search, steps predicted in it, and errors of the model.
-
-    ``of_model``: ``scenes``, ``reach`` and ``chunk`` of :class:`InModel`.
-    """
+    """How an episode ended, predicted steps, and of each plan seconds and errors. ``of_model``: of :class:`InModel`."""
     _, info = env.reset(seed=seed)
-    task, rng = env.unwrapped, np.random.default_rng((seed, 1))  # the scene is drawn with ``seed``
-    encoding, planning, predicted = [], [], []
+    task, rng, times, predicted = env.unwrapped, np.random.default_rng((seed, 1)), [], []  # ``seed`` drew the scene
     model = InModel(task, seed, **of_model) if agent == "model" else None
+
+    def counted(state, given):
+        predicted.append(len(given) * SETTINGS["horizon"])
+        return dynamics(state, given)
+
     if agent in PLANNERS:
-        dynamics, cost = Counted(TrueDynamics(task)), GoalCost(torch.from_numpy(task.goal))
+        dynamics, cost = TrueDynamics(task), GoalCost(torch.from_numpy(task.goal))
         planner = model.planner if model else PLANNERS[agent](dynamics, cost, -FASTEST, FASTEST, seed=seed, **SETTINGS)
+        dynamics, planner.dynamics = planner.dynamics, counted
     ended, steps, reward, actions = False, 0, 0.0, []
     while not ended:
-        if agent == "zero":
-            actions = [np.zeros(2, np.float32)]
-        elif agent == "random":
-            actions = [rng.uniform(-MAX_SPEED, MAX_SPEED, 2).astype(np.float32)] * EVERY
+        if agent not in PLANNERS:
+            actions = [rng.uniform(-MAX_SPEED, MAX_SPEED, 2).astype(np.float32) * (agent == "random")] * EVERY
         else:
-            before, start = planner.dynamics.steps, time.perf_counter()
+            start = time.perf_counter()
             state = model.state() if model else task.simulation.state()
-            encoded = time.perf_counter()  # the search ends with a copy to the CPU, as encoding does
+            encoded = time.perf_counter()  # ends with a copy to the CPU, as the search does
             plan = planner.plan(state, len(actions))
-            encoding.append(encoded - start)
-            planning.append(time.perf_counter() - encoded)
-            predicted.append(planner.dynamics.steps - before)
+            times.append((encoded - start, time.perf_counter() - encoded))
             if model:
                 model.compare(plan)
             actions = list(plan.actions[:EVERY].numpy().astype(np.float32))
@@ -129,38 +110,34 @@ def run(agent: str, env: gymnasium.Env, seed: int, **of_model) -> dict:
             if ended:
                 break
     found = {"seed": seed, "solved": info["is_success"], "distance": -reward, "steps": steps}
-    found |= {"encode_seconds": encoding if model else [], "plan_seconds": planning, "plan_steps": predicted}
-    return {**found, "errors": model.errors if model else []}
+    found |= zip(("encode_seconds", "plan_seconds"), np.reshape(times, (-1, 2)).T.tolist(), strict=True)
+    return {**found, "predicted_steps": sum(predicted), "errors": model.errors if model else []}
 
 
 def wilson(solved: int, count: int, z: float = 1.959964) -> tuple[float, float]:
     """The 95 % interval of a share."""
     share, spread = solved / count, z * z / count
     half = z * math.sqrt(share * (1 - share) / count + spread / (4 * count))
-    low, high = ((share + spread / 2 + sign * half) / (1 + spread) for sign in (-1, 1))
-    return max(0.0, low), min(1.0, high)
+    return tuple(min(1.0, max(0.0, (share + spread / 2 + sign * half) / (1 + spread))) for sign in (-1, 1))
 
 
 def summary(episodes: list[dict]) -> dict:
     """Numbers of an agent."""
-    solved = sum(episode["solved"] for episode in episodes)
     steps = [episode["steps"] for episode in episodes if episode["solved"]]
-    encoding, times, predicted = (
-        np.array([value for episode in episodes for value in episode[name]])
-        for name in ("encode_seconds", "plan_seconds", "plan_steps")
-    )
+    encoding, times = (sum((one[f"{name}_seconds"] for one in episodes), []) for name in ("encode", "plan"))
     errors = np.array([plan for episode in episodes for plan in episode["errors"]])  # [plans, 2, H]
-    middle = np.median(errors, 0).tolist() if len(errors) else []
     return {
-        "solved": solved,
+        "solved": len(steps),
         "episodes": len(episodes),
-        "interval": wilson(solved, len(episodes)),
+        "interval": wilson(len(steps), len(episodes)),
         "median_distance": np.median([episode["distance"] for episode in episodes]),
         "median_steps": np.median(steps) if steps else None,
-        "median_encode_seconds": np.median(encoding) if len(encoding) else None,
-        "median_plan_seconds": np.median(times) if len(times) else None,
-        "steps_a_second": np.median(predicted / times) if len(times) else None,
-        "median_errors": dict(zip(("model", "rest"), middle, strict=False)),
+        "median_encode_seconds": np.median(encoding) if times else None,
+        "median_plan_seconds": np.median(times) if times else None,
+        "steps_a_second": sum(one["predicted_steps"] for one in episodes) / sum(times) if times else None,
+        "median_errors": dict(
+            zip(("model", "rest"), np.median(errors, 0).tolist() if len(errors) else [], strict=False)
+        ),
         "runs": episodes,
     }
 
@@ -173,9 +150,8 @@ def show(agent: str, found: dict) -> None:
     if found["median_steps"] is not None:
         text += f", {found['median_steps']:.0f} steps"
     if found["median_plan_seconds"] is not None:
-        text += f", {found['median_plan_seconds']:.2f} s a plan, {found['steps_a_second']:.0f} steps a second"
-    if found["median_encode_seconds"] is not None:
         text += f", {found['median_encode_seconds']:.2f} s to encode"
+        text += f", {found['median_plan_seconds']:.2f} s a plan, {found['steps_a_second']:.0f} steps a second"
     for what, errors in found["median_errors"].items():
         text += f"\n        error of {what}: " + " ".join(f"{100 * error:.1f}" for error in errors) + " cm"
     print(text, flush=True)
