@@ -1,7 +1,7 @@
 """Physical measures of moving points by step: momentum, energy, rigidity, penetration, permanence.
 
-Every point has the same weight. Points are particles on visible surfaces; the truth is of the same points, where the
-generator's bodies carry them from the last given step on.
+Every point has the same weight. Each method has points of its own, such as particles on visible surfaces; the truth
+beside it is of the same points, where the generator's bodies carry them from the last given step on.
 """
 
 import math
@@ -20,6 +20,7 @@ from gsim3d.synth.embedding import ParticleCloud
 
 GRAVITY = 9.81  # m/s^2
 MARGIN = 0.5  # metres around the scene's bounds
+TRUE = "true "  # start of the name of a measure of the truth
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,8 @@ MEASURES = {
 def measure(
     points: Tensor, bodies: Tensor, fps: float, bounds: Tensor, ground: float | None = 0.0
 ) -> dict[str, Tensor]:
-    """Returns each measure of MEASURES at every step after the first, float64 [S - 1].
+    """Returns each measure of MEASURES at every step after the first, float64 [S - 1]; NaN from a step on whose points
+    are not all finite.
 
     Args:
         points: [S, N, 3] metres, in correspondence over the steps; z is up.
@@ -58,17 +60,20 @@ def measure(
     points = points.double()
     if points.ndim != 3 or points.shape[0] < 2 or points.shape[1] == 0:
         raise InputError(f"measure: points must be [S >= 2, N >= 1, 3]; got {list(points.shape)}")
+    broken = (~points.isfinite()).flatten(1).any(1).cumsum(0) > 0
+    points = points.masked_fill(broken[:, None, None], 0)
     velocities = points.diff(dim=0) * fps
     later, heights = points[1:], points[..., 2].mean(1)
     low, high = bounds.double()
     inside = ((later >= low - MARGIN) & (later <= high + MARGIN)).all(-1).double()
-    return {
+    found = {
         "momentum": velocities.mean(1).norm(dim=1),
         "energy": velocities.square().sum(-1).mean(1) / 2 + GRAVITY * (heights[1:] + heights[:-1]) / 2,
         "rigidity": _residuals(points, bodies).square().mean(1).sqrt(),
         "penetration": ((math.nan if ground is None else ground) - later[..., 2]).clamp_min(0).mean(1),
         "permanence": inside.mean(1),
     }
+    return {name: values.masked_fill(broken[1:], math.nan) for name, values in found.items()}
 
 
 def _residuals(points: Tensor, bodies: Tensor) -> Tensor:
@@ -88,18 +93,19 @@ def _residuals(points: Tensor, bodies: Tensor) -> Tensor:
 def measure_tracks(tracks: Mapping[str, Tensor], scene: Scene, steps: range) -> dict[str, dict[str, Tensor]]:
     """Measures the moving points [S, N, 3] of each method over ``steps``, of which the first is the last given one.
 
-    Methods without points are left out. The first of the others has the "truth" beside it, if the scene has its states.
+    Methods without points are left out. If the scene has its states, each method also has the measures of the truth of
+    its points, named ``TRUE + name``.
     """
     states, found = true_states(scene), {}
     given = scene.fps, torch.from_numpy(scene.bounds), scene.ground_height
     for name, points in tracks.items():
         if points.shape[1] == 0:
             continue
-        bodies = torch.zeros(points.shape[1], dtype=torch.int64)
-        if states is not None:
+        bodies, truth = torch.zeros(points.shape[1], dtype=torch.int64), {}
+        if states is not None and bool(points[0].isfinite().all()):
             true, bodies = carried(points[0], [nodes[steps.start : steps.stop] for nodes in states])
-            found.setdefault("truth", measure(true, bodies, *given))
-        found[name] = measure(points, bodies, *given)
+            truth = {TRUE + key: values for key, values in measure(true, bodies, *given).items()}
+        found[name] = measure(points, bodies, *given) | truth
     return found
 
 

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from gsim3d.evaluate.metrics import mean_of_counted
 from gsim3d.evaluate.perceptual.fvd import MIN_CLIPS, TREND_CLIPS, frechet_distance
-from gsim3d.evaluate.physics import MEASURES
-from gsim3d.evaluate.scoring import METRICS, RING_WIDTH, SceneScores
+from gsim3d.evaluate.physics import MEASURES, TRUE, Measure
+from gsim3d.evaluate.scoring import METRICS, RING_WIDTH, Metric, SceneScores
 from gsim3d.io.files import write_whole
 from gsim3d.synth.held_out import describe_set
 
@@ -31,12 +31,13 @@ def summarize(scores: Sequence[SceneScores], not_measured: dict[str, str] | None
     - ``past.M``, ``future.M``, ``future_late.M``: mean of metric M over scenes, then over input steps, predicted steps,
       or the second half of the predicted steps.
     - ``past_std.M``, ``future_std.M``: mean over steps of the standard deviation between scenes.
-    - ``<method>.future.M``: the same for baselines and other predictions.
+    - ``<method>.future.M``: the same for baselines and other predictions, over the scenes that have them;
+      ``n_scenes_of``: method -> how many, if not all.
     - ``future.fvd``: distance between all predicted and all true clips.
     - ``body_share``: fraction of the foreground covered by bodies.
     - ``added_mse.R``: mean squared error in region R, predicted steps minus input steps.
-    - ``physics``: method or "truth" -> measure of :mod:`gsim3d.evaluate.physics` -> mean over scenes for each predicted
-      step.
+    - ``physics``: method -> measure of :func:`gsim3d.evaluate.physics.measure_tracks` -> mean over scenes for each
+      predicted step.
     - ``by_step``, ``by_step_std``: mean over scenes and deviation between scenes, for each step.
     - ``not_measured``: metric -> reason.
 
@@ -47,26 +48,27 @@ def summarize(scores: Sequence[SceneScores], not_measured: dict[str, str] | None
         not_measured: metrics that were not requested -> reason.
     """
     n_encoded = scores[0].n_encoded
-    methods = [method for method in scores[0].values if all(method in s.values for s in scores)]
     n_steps = min(s.n_steps for s in scores)
     late = n_encoded + (n_steps - n_encoded) // 2
     missing = dict(not_measured or {})
     for scene in scores:
         missing = {**scene.not_measured, **missing}
+    methods = {method: [s for s in scores if method in s.values] for one in scores for method in one.values}
     result: dict = {
         "n_scenes": len(scores),
         "n_encoded_steps": n_encoded,
         "n_future_steps": n_steps - n_encoded,
-        "methods": methods,
+        "methods": list(methods),
+        "n_scenes_of": {method: len(own) for method, own in methods.items() if len(own) < len(scores)},
     }
     by_step: dict = {}
     by_step_std: dict = {}
-    for method in methods:
+    for method, own in methods.items():
         prefix = _prefix(method)
         for metric in METRICS:
-            if metric in missing or metric not in scores[0].values[method]:
+            if metric in missing or metric not in own[0].values[method]:
                 continue
-            table = torch.stack([s.values[method][metric][:n_steps] for s in scores])
+            table = torch.stack([s.values[method][metric][:n_steps] for s in own])
             mean, deviation = table.nanmean(0), _deviation(table)
             if method == "model":
                 result[f"past.{metric}"] = mean_of_counted(mean[:n_encoded])
@@ -93,12 +95,13 @@ def summarize(scores: Sequence[SceneScores], not_measured: dict[str, str] | None
 
 
 def _mean_physics(scores: Sequence[SceneScores], n_future: int) -> dict:
-    """Means over scenes of what all scenes have."""
-    methods = [method for method in scores[0].physics if all(s.physics.get(method) for s in scores)]
-    return {
-        method: {m: _numbers(torch.stack([s.physics[method][m][:n_future] for s in scores]).mean(0)) for m in MEASURES}
-        for method in methods
-    }
+    """Means over the scenes that have a method, of what all of these have."""
+    found = {}
+    for method in dict.fromkeys(method for s in scores for method in s.physics):
+        own = [s.physics[method] for s in scores if method in s.physics]
+        shared = [name for name in own[0] if all(name in one for one in own)]
+        found[method] = {name: _numbers(torch.stack([one[name][:n_future] for one in own]).mean(0)) for name in shared}
+    return found
 
 
 def physics_table(summary: dict) -> list[str]:
@@ -111,22 +114,24 @@ def physics_table(summary: dict) -> list[str]:
     lines = ["", _row(head), _row(["---"] * len(head))]
     for name, measure in MEASURES.items():
         for method, values in summary["physics"].items():
-            shown = ("-" if (v := values[name][step]) is None else f"{v:.{measure.digits}f}" for step in steps)
+            both = [values[key] for key in (name, TRUE + name) if key in values]
+            shown = (" of ".join(_digits(one[step], measure) for one in both) for step in steps)
             lines.append(_row([measure.label, method, *shown]))
     formulas = "; ".join(f"{name}: {measure.formula}" for name, measure in MEASURES.items())
-    return [*lines, "", f"Per unit mass, points weighted equally, v from one step to the next, h halfway: {formulas}."]
+    said = "Per unit mass, points weighted equally, v from step to step, h halfway; of: the truth of a method's points"
+    return [*lines, "", f"{said}. {formulas}."]
 
 
 def _add_fvd(result: dict, missing: dict, scores: Sequence[SceneScores]) -> None:
     counted = [s.clips for s in scores if s.clips]
-    clips = {method: torch.cat([clips[method] for clips in counted]) for method in counted[0]}
-    truth = clips.pop("truth")
-    result["n_clips"] = len(truth)
-    if len(truth) < MIN_CLIPS:
+    result["n_clips"] = sum(len(clips["truth"]) for clips in counted)
+    if result["n_clips"] < MIN_CLIPS:
         missing["fvd"] = f"at least {MIN_CLIPS} clips (scenes times target views) are required; there is 1"
         return
-    for method, features in clips.items():
-        result[f"{_prefix(method)}future.fvd"] = frechet_distance(features, truth)
+    for method in dict.fromkeys(method for clips in counted for method in clips if method != "truth"):
+        predicted, true = (torch.cat([clips[of] for clips in counted if method in clips]) for of in (method, "truth"))
+        if len(true) >= MIN_CLIPS:
+            result[f"{_prefix(method)}future.fvd"] = frechet_distance(predicted, true)
 
 
 def _of_scene(scores: SceneScores, missing: dict) -> dict:
@@ -180,7 +185,8 @@ def markdown(summary: dict, dataset: str) -> str:
     lines = [_row(["Dataset", "Method", *head]), _row(["---"] * (2 + len(head)))]
     for method in summary["methods"]:
         key = f"{_prefix(method)}future"
-        lines.append(_row([dataset, f"{method} ({span})", *(_with_deviation(summary, key, m) for m in shown)]))
+        name = f"{_label(summary, method)} ({span})"
+        lines.append(_row([dataset, name, *(_with_deviation(summary, key, m) for m in shown)]))
     by_step = [m for m in shown if METRICS[m].by_step]
     lines += ["", _row(["Horizon", "Method", *(METRICS[m].label for m in by_step)]), _row(["---"] * (2 + len(by_step)))]
     for name, part in (("given steps", "past"), ("predicted, all", "future"), ("second half", "future_late")):
@@ -226,7 +232,8 @@ def table(summary: dict) -> str:
         prefix = _prefix(method)
         if not any(f"{prefix}future.{m}" in summary for m in shown):
             continue
-        rows += [(f"{method}, predicted steps", f"{prefix}future"), ("  second half of them", f"{prefix}future_late")]
+        named = f"{_label(summary, method)}, predicted steps"
+        rows += [(named, f"{prefix}future"), ("  second half of them", f"{prefix}future_late")]
     width = max([34, *(len(name) + 2 for name, _ in rows)])
     lines = [
         f"{summary['n_scenes']} scenes, {summary['n_encoded_steps']} steps given, {summary['n_future_steps']} predicted"
@@ -252,6 +259,12 @@ def _prefix(method: str) -> str:
     return "" if method == "model" else f"{method}."
 
 
+def _label(summary: dict, method: str) -> str:
+    """The name of a method, and its number of scenes where it is not in all."""
+    count = summary.get("n_scenes_of", {}).get(method)
+    return method if count is None else f"{method}, {count} scene{'s' * (count > 1)}"
+
+
 def _row(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
@@ -274,4 +287,8 @@ def _numbers(values: Tensor) -> list[float | None]:
 
 
 def _number(value: float | None, metric: str) -> str:
-    return "-" if value is None else f"{value:.{METRICS[metric].digits}f}"
+    return _digits(value, METRICS[metric])
+
+
+def _digits(value: float | None, kind: Metric | Measure) -> str:
+    return "-" if value is None else f"{value:.{kind.digits}f}"

@@ -61,7 +61,7 @@ class SceneScores:
     #: float64 [S], fraction of the foreground covered by bodies, mean over the target views; None without labels
     body_share: Tensor | None = None
     digest: str = ""  #: hash of the true images and labels
-    #: method (and ``"truth"``) -> measure of :mod:`gsim3d.evaluate.physics` -> float64 [S - n_encoded]
+    #: method -> measure of :func:`gsim3d.evaluate.physics.measure_tracks` -> float64 [S - n_encoded]
     physics: dict[str, dict[str, Tensor]] = field(default_factory=dict)
     fitted: dict[str, dict] = field(default_factory=dict)  #: method that is fitted to the scene -> what it found
 

@@ -197,8 +197,7 @@ def _merged(lines: Sequence[Line]) -> dict:
     for key in ("by_step", "by_step_std"):
         merged[key] = {f"{ln.label}.{m}": v for ln in lines for m, v in ln.summary[key].items() if m in METRICS}
     physics = {line.label: line.summary["physics"]["model"] for line in lines if "model" in line.summary["physics"]}
-    truth = {"truth": first["physics"]["truth"]} if "truth" in first["physics"] else {}
-    return {**merged, "methods": [line.label for line in lines], "physics": {**truth, **physics}}
+    return {**merged, "methods": [line.label for line in lines], "physics": physics}
 
 
 def _remarks(lines: Sequence[Line]) -> str:

@@ -11,6 +11,7 @@ from gsim3d.data.fitting import Fitting
 from gsim3d.errors import InputError
 from gsim3d.evaluate.physics import (
     MEASURES,
+    TRUE,
     fall_ratio,
     measure,
     measure_tracks,
@@ -125,19 +126,41 @@ def test_the_truth_of_a_spinning_body_is_of_its_points(tmp_path):
     true = centres[1:, None] + shape @ turns[1:].mT
     tracks = {"none": true[:, :0], "model": centres[1] + (shape @ turns[1].T).expand_as(true), "other": true}
     found = measure_tracks(tracks, scene, range(1, 6))
-    assert list(found) == ["truth", "model", "other"]
-    for name, values in found["truth"].items():
+    assert list(found) == ["model", "other"]
+    truth = {name: found["model"][TRUE + name] for name in MEASURES}
+    for name, values in truth.items():
         torch.testing.assert_close(values, found["other"][name], rtol=1e-6, atol=1e-6)
-    assert found["truth"]["momentum"].numpy() == pytest.approx(0.3) and found["truth"]["rigidity"].max() < 1e-7
+    assert truth["momentum"].numpy() == pytest.approx(0.3) and truth["rigidity"].max() < 1e-7
     chord = 2 * math.sin(1.5 / 12) * 12  # of a turn by 3 rad/s, in m/s at 1 m from the axis
     axis = turns[1] @ torch.tensor([0.6, 0, 0.8]).double()  # the same in all frames
     apart = (shape.square().sum(1) - (shape @ axis).square()).mean()
     energy = (0.09 + chord**2 * apart) / 2 + 9.81 * 0.7
-    assert found["truth"]["energy"].numpy() == pytest.approx(energy.item())
+    assert truth["energy"].numpy() == pytest.approx(energy.item())
     at_rest = found["model"]
     assert at_rest["momentum"].max() == 0 and at_rest["energy"].numpy() == pytest.approx(9.81 * 0.7)
     below = (0.5 - tracks["model"][0, :, 2]).clamp_min(0).mean().item()
     assert below > 0 and at_rest["penetration"].numpy() == pytest.approx(below)
+
+
+def test_each_method_has_the_truth_of_its_own_points(tmp_path):
+    scene, centres, turns = spinning(tmp_path / "a" / "0")
+    shape = cloud(3) - cloud(3).mean(0)
+    tracks = {name: centres[1:, None] + (shape + up) @ turns[1:].mT for name, up in (("model", 0.3), ("springs", 0))}
+    found = measure_tracks(tracks, scene, range(1, 6))
+    for values in found.values():
+        torch.testing.assert_close(values["energy"], values[TRUE + "energy"], rtol=1e-6, atol=1e-6)
+    assert (found["model"][TRUE + "energy"] - found["springs"][TRUE + "energy"]).abs().min() > 0.1
+    given = [SceneScores(name, 2, 6, {"model": {"psnr": torch.ones(6)}}, {}, {}, physics=found) for name in "ab"]
+    energy = found["springs"]["energy"][0].item()
+    assert f"| energy [J/kg] | springs | {energy:.3f} of {energy:.3f} |" in "\n".join(physics_table(summarize(given)))
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_points_that_are_not_finite_have_no_measures_from_there_on(value):
+    points = cloud().expand(5, 20, 3).clone()
+    points[3, 7, 1] = value
+    for values in measure(points, ONE, 1.0, SPACE).values():
+        assert values.isfinite().tolist() == [True, True, False, False]
 
 
 def test_the_truth_of_fewer_frames(tmp_path):
