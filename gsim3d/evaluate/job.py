@@ -6,7 +6,7 @@ from pathlib import Path
 
 from gsim3d.baselines import baseline
 from gsim3d.data import Scene, find_scenes, published_split, split_scenes
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, NumericalError
 from gsim3d.evaluate import compare, trust
 from gsim3d.evaluate.pictures import write_curves
 from gsim3d.evaluate.predictions import Predictions
@@ -67,6 +67,10 @@ def evaluate(job: Job) -> None:
         raise InputError("--resample, --keep, --trust and --calibrate-trust require a CHECKPOINT")
     if job.calibrate_trust and (job.predictions or job.baselines or job.trust or other):
         raise InputError("--calibrate-trust cannot be combined with --predictions, --baselines, --trust or --against")
+    if job.context and (job.trust or job.calibrate_trust):
+        raise InputError("--context cannot be combined with --trust or --calibrate-trust")
+    if job.calibrate_trust and folder_of(job.checkpoint).resolve().is_relative_to(FOLDER.resolve()):
+        raise InputError(f"--calibrate-trust: {job.checkpoint} is part of the package; copy its folder, and give that")
     with joined(job.device) as processes:
         _evaluate(job, metrics, not_measured, other, processes)
 
@@ -84,26 +88,28 @@ def _evaluate(job: Job, metrics: tuple, not_measured: dict, against: dict | None
     n_encoded = job.given if restored is None else restored.data.history
     scenes, conditions = _open_scenes(job, restored)
     views, n_future = _views(job, restored, others, scenes, n_encoded)
+    if job.trust or job.calibrate_trust:
+        trust.check(scenes)
     if job.calibrate_trust:
         if processes.is_first:
             made = trust.calibrate(restored, scenes, n_future)
             print(f"written: {trust.save_trust(folder_of(job.checkpoint), restored.checkpoint.digest, made)}")
         return
-    not_applicable = {}
-    for scene, (_, targets) in zip(scenes, views):
+    names, not_applicable, applied = [_name(scene, job.data) for scene in scenes], {}, []
+    for name, scene, (_, targets) in zip(names, scenes, views, strict=True):
+        applied.append([])
         for other in others:
             try:
                 other.check(scene, targets, n_encoded, n_future)
+                applied[-1].append(other)
             except InputError as error:
                 if other not in fitted:
                     raise
-                not_applicable.setdefault(other.name, str(error))
-    others = [other for other in others if other.name not in not_applicable]
-    names = [_name(scene, job.data) for scene in scenes]
+                not_applicable.setdefault(other.name, {})[name] = str(error)
     conditions |= {
         "checkpoint": None if restored is None else restored.checkpoint.digest,
         "effects": None if restored is None else restored.plan.spec.hash,
-        "predictions": {other.name: str(other.folder) for other in others},
+        "predictions": {other.name: str(other.folder) for other in others if any(other in own for own in applied)},
         "not_applicable": not_applicable,
         "fitted": {other.name: asdict(other.config) for other in fitted},
         "data": str(job.data),
@@ -117,24 +123,24 @@ def _evaluate(job: Job, metrics: tuple, not_measured: dict, against: dict | None
     processes.check_agreement(**{"CHECKPOINT, DATA or options": (conditions, n_future, metrics)})
     if against is not None:
         compare.check_same({"n_encoded_steps": n_encoded, "n_future_steps": n_future}, names, against, job.against)
-    given = {"n_encoded": n_encoded, "n_future": n_future, "metrics": metrics, "others": others, "clips": job.clips}
+    given = {"n_encoded": n_encoded, "n_future": n_future, "metrics": metrics, "others": applied, "clips": job.clips}
     scores = score_scenes(restored, scenes, views, **given, processes=processes, quiet=False)
     if not processes.is_first:
         return
     scores = [replace(score, scene=name) for score, name in zip(scores, names, strict=True)]
     summary = {**conditions, **summarize(scores, not_measured)}
-    print("\n".join([table(summary), *not_applicable.values()]))
-    if job.trust:
-        summary["trust"] = trust.report(restored.simulator.trust, trust.collect(restored, scenes, n_future))
-        print(f"\n{trust.table(summary['trust'])}")
+    print("\n".join([table(summary), *(reason for own in not_applicable.values() for reason in own.values())]))
     refused = None
-    if against is not None:
-        try:
+    try:
+        if job.trust:
+            summary["trust"] = trust.report(restored.simulator.trust, trust.collect(restored, scenes, n_future))
+            print(f"\n{trust.table(summary['trust'])}")
+        if against is not None:
             comparison = compare.compare(summary, against, job.against)
             summary["against"] = {"file": job.against, "checkpoint": against.get("checkpoint"), **comparison[""]}
             print(f"\n{compare.table(comparison, job.against)}")
-        except InputError as error:  # raised after the scores are written
-            refused = error
+    except (InputError, NumericalError) as error:  # raised after the scores are written
+        refused = error
     files = _write(out, job.data, scores, summary)
     print("\nwritten: " + ", ".join(str(path) for path in files))
     if refused is not None:

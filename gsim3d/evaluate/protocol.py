@@ -361,7 +361,7 @@ def score_scenes(
     n_future: int,
     metrics: Sequence[str] = PLAIN_METRICS,
     methods: Sequence[str] = METHODS,
-    others: Sequence[Predictions] = (),
+    others: Sequence[Sequence[Predictions]] | None = None,
     clips: int = CLIPS,
     processes: Processes | None = None,
     quiet: bool = True,
@@ -369,9 +369,10 @@ def score_scenes(
     """Scores scenes with :func:`score_scene`; a GPU predicts several per rollout.
 
     Args:
-        restored, n_encoded, n_future, metrics, methods, others: see :func:`score_scene`.
+        restored, n_encoded, n_future, metrics, methods: see :func:`score_scene`.
         scenes: scenes to predict.
         views: (context, target) cameras of each scene.
+        others: predictions of other models for each scene.
         clips: largest number of clips for FVD, taken from evenly spaced scenes.
         processes: processes that share the scenes. All must call this function, and all return the same scores, equal
             in bits to those of a single process.
@@ -383,7 +384,7 @@ def score_scenes(
         groups = _batches(restored, scenes, [context for context, _ in views])
     n_for_fvd = min(len(scenes), max(1, clips // max(len(targets) for _, targets in views)))
     for_fvd = {k * len(scenes) // n_for_fvd for k in range(n_for_fvd)}
-    given = {"n_encoded": n_encoded, "n_future": n_future, "methods": methods, "others": others}
+    given = {"n_encoded": n_encoded, "n_future": n_future, "methods": methods}
 
     def scored(group: Sequence[int]) -> Iterator[tuple[int, SceneScores]]:
         predictions = [None] * len(group)
@@ -392,7 +393,7 @@ def score_scenes(
             predictions = predict_together(restored, [scenes[number] for number in group], n_future, contexts)
         for number, prediction in zip(group, predictions, strict=True):
             (context, targets), own = views[number], [m for m in metrics if m != "fvd" or number in for_fvd]
-            cams = {"context_cams": context, "target_cams": targets}
+            cams = {"context_cams": context, "target_cams": targets, "others": others[number] if others else ()}
             yield number, score_scene(restored, scenes[number], **cams, **given, metrics=own, prediction=prediction)
 
     scores: dict[int, SceneScores] = {}

@@ -44,13 +44,19 @@ def samples(scene: Scene, prediction: Prediction) -> Samples | None:
     return prediction.spread[: len(truth), moving].double().cpu().numpy(), error.numpy()
 
 
+def check(scenes: Sequence[Scene]) -> None:
+    """Raises InputError if no scene has a known motion."""
+    if not [scene for scene in scenes if true_states(scene)]:
+        raise InputError("trust: needs generated scenes, with states.npz; no scene has one")
+
+
 def collect(restored: Restored, scenes: Sequence[Scene], n_future: int) -> list[Samples]:
     """Predicts scenes with their spread; returns the samples of those with known motion. Raises InputError if there is
     none."""
     shown = progress(list(scenes), "trust", unit="scene")
     made = [samples(one, predict_together(restored, [one], n_future, with_spread=True)[0]) for one in shown]
     if not (found := [pair for pair in made if pair is not None]):
-        raise InputError("trust: needs generated scenes, with states.npz and moving bodies")
+        raise InputError("trust: needs scenes with moving bodies; nothing moves in those with states.npz")
     return found
 
 

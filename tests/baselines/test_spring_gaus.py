@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 
 import pytest
 import torch
@@ -92,8 +93,10 @@ def test_evaluate_scores_baselines_without_a_checkpoint(data, quick, tmp_path):
     given = {"given": 4, "steps": 4, "cameras": TARGETS, "scenes": "all", "metrics": ["psnr", "psnr_body"]}
     evaluate(Job(data=str(data), baselines=["spring-gaus"], out=str(out), **given))
     report = json.loads(out.read_text())
-    energy = {name: values["energy"] for name, values in report["physics"].items()}
-    assert list(energy) == ["truth", "spring-gaus"] and energy["truth"] == pytest.approx(energy["spring-gaus"], rel=0.2)
+    physics = report["physics"]["spring-gaus"]
+    assert list(report["physics"]) == ["spring-gaus"] and physics["true energy"] == pytest.approx(
+        physics["energy"], rel=0.2
+    )
     (found,) = [scene["fitted"]["spring-gaus"] for scene in report["scenes"].values()]
     assert found["substeps"] >= 5 and len(found["velocity"]) == 3 and found["stiffness"] > 0
     assert report["not_applicable"] == {} and "spring-gaus" in report["predictions"]
@@ -119,8 +122,31 @@ def test_where_it_does_not_apply_it_says_why(data, quick, tmp_path, monkeypatch,
         evaluate(Job(data=str(data), baselines=["spring-gaus"] * 2, given=4))
     job = Job(data=str(data), baselines=["spring-gaus"], given=4, steps=4, cameras=TARGETS, scenes="all", out=str(out))
     evaluate(job)
-    assert "4 bodies" in json.loads(out.read_text())["not_applicable"]["spring-gaus"]
-    assert "4 bodies" in capsys.readouterr().out
+    (reason,) = json.loads(out.read_text())["not_applicable"]["spring-gaus"].values()
+    assert "4 bodies" in reason and "4 bodies" in capsys.readouterr().out
+
+
+def test_a_scene_where_it_does_not_apply_is_left_out_alone(data, quick, tmp_path, monkeypatch, capsys):
+    (scene,) = find_scenes(data)
+    for name in ("0000", "0001", "0002"):
+        shutil.copytree(scene, tmp_path / "set" / "spot" / name)
+    count = spring_gaus._hull
+    monkeypatch.setattr(spring_gaus, "_hull", lambda scene, *given: (*count(scene, *given)[:1], scene.name))
+    monkeypatch.setattr(spring_gaus, "_count_bodies", lambda name: 4 if name.endswith("0001") else 1)
+    monkeypatch.setattr(spring_gaus.SpringGaus, "points", lambda *given: torch.zeros(5, 0, 3))
+    monkeypatch.setattr(spring_gaus.SpringGaus, "found", lambda self: {"substeps": 5})
+    for name in ("images", "object_images"):
+        monkeypatch.setattr(spring_gaus.SpringGaus, name, lambda self, scene, cams, n_encoded, n_future: (
+            scene.images(cams, range(n_encoded, n_encoded + n_future)).permute(0, 1, 3, 4, 2)))  # fmt: skip
+    given = {"given": 4, "steps": 4, "cameras": TARGETS, "scenes": "all", "metrics": ["psnr"]}
+    out = tmp_path / "metrics.json"
+    evaluate(Job(data=str(tmp_path / "set"), baselines=["spring-gaus"], out=str(out), **given))
+    report = json.loads(out.read_text())
+    assert list(report["not_applicable"]["spring-gaus"]) == ["spot/0001"]
+    assert report["n_scenes"] == 3 and report["n_scenes_of"]["spring-gaus"] == 2
+    assert report["spring-gaus.future.psnr"] == 100 and report["copy.future.psnr"] < 100
+    assert "spring-gaus, 2 scenes, predicted steps" in capsys.readouterr().out
+    assert "| spring-gaus, 2 scenes (4-4) | 100.00" in out.with_suffix(".md").read_text()
 
 
 def test_bodies_are_counted():

@@ -11,7 +11,7 @@ import torch
 from gsim3d import presets
 from gsim3d.cli.main import main
 from gsim3d.errors import InputError, UnfamiliarInput
-from gsim3d.evaluate import trust as calibration
+from gsim3d.evaluate import job, trust as calibration
 from gsim3d.evaluate.protocol import default_views, input_frames, predict, predict_together
 from gsim3d.io.checkpoint import Checkpoint, export
 from gsim3d.io.settings import to_dict
@@ -237,6 +237,27 @@ def test_verdict(restored, scenes):
     assert "exceeds 0.02 m from predicted step 2 on (0.03 m)" in made_trust().verdict(bounds, particles, 0.02)
     assert "stays within 0.5 m for all 2 predicted steps" in made_trust().verdict(bounds, particles, 0.5)
     assert "steps after 1 are beyond the calibration" in made_trust(n_steps=1).verdict(bounds, particles, 0.5)
+
+
+def test_what_trust_needs_is_checked_before_scoring(work, tmp_path, capsys, monkeypatch):
+    model, write = work / "model.safetensors", job.score_scenes
+    monkeypatch.setattr(calibration, "samples", lambda *given: None)
+    monkeypatch.setattr(job, "score_scenes", None)
+    calibration.save_trust(work, restore(model).checkpoint.digest, made_trust())
+    write_scene(tmp_path / "data" / "ball" / "0000")
+    evaluate = ["evaluate", str(model), str(tmp_path / "data"), "--scenes", "all", "--metrics", "psnr"]
+    evaluate += ["--out", str(tmp_path / "report.json")]
+    assert main([*evaluate, "--trust"]) == 2 and "no scene has one" in capsys.readouterr().err
+    for option in ("--trust", "--calibrate-trust"):
+        assert main([*evaluate, option, "--context", "0", "1"]) == 2
+        assert "--context cannot be combined" in capsys.readouterr().err
+    shipped = ["evaluate", "elastic-small", str(work / "data"), "--calibrate-trust"]
+    assert main(shipped) == 2 and "elastic-small is part of the package" in capsys.readouterr().err
+    monkeypatch.setattr(job, "score_scenes", write)
+    write_states(tmp_path / "data" / "ball" / "0001")
+    assert main([*evaluate, "--trust"]) == 2 and "nothing moves" in capsys.readouterr().err
+    assert json.loads((tmp_path / "report.json").read_text())["n_scenes"] == 2
+    (work / "trust.json").unlink()
 
 
 def test_commands(work, tmp_path, capsys):
