@@ -138,13 +138,17 @@ class Simulation:
 
     @torch.no_grad()
     def spread(self, part: Part) -> Tensor:
-        """Spread of the particles over variants of a part, [S, N] metres on the CPU; predicts them the first time."""
+        """Spread of the particles over variants of a part, [S, N] metres on the CPU; predicts them the first time. Its
+        variants start from the prediction, so the spread that those of the part before have reached is added."""
         if part not in self._spreads:
             histories = [part.history]
             if part.first == 0 and not part.edits and self._frames is not None:
                 histories = encode_histories(self._simulator, self._frames)
-            made = rollout_with_spread(self._simulator, histories, len(part.steps), part.plan)
-            self._spreads[part] = made[1].cpu()
+            spread = rollout_with_spread(self._simulator, histories, len(part.steps), part.plan)[1].cpu()
+            if (before := self._part_before(part.first)) is not None:
+                reached = self.spread(before)[part.first - before.first - 1]
+                spread += reached if len(reached) == spread.shape[1] else reached.amax()  # other particles after edits
+            self._spreads[part] = spread
         return self._spreads[part]
 
     def _step_after(self, frame: int) -> int:
@@ -181,8 +185,7 @@ class Simulation:
         The scene changes by ``operations`` right after ``frame``.
 
         Raises:
-            InputError: an operation cannot be made, and nothing has changed; or ``frame`` is not the last given or a
-                predicted one.
+            InputError: nothing changes: an operation cannot be made, or ``frame`` is not the last given or predicted.
         """
         self.take(self.predicted(frame, n_steps, operations, self.effects))
 
@@ -236,8 +239,6 @@ class Simulation:
         of = Selection(which, corners) if body is None else OfBody(which, corners, body)
         return OPERATIONS[name](of, **fields)
 
-    # Bodies
-
     def bodies(self, frame: int) -> dict[int, Tensor]:
         """Number of each body of a frame -> rows of its particles, int64."""
         label = self.target.particles[frame].label
@@ -254,8 +255,6 @@ class Simulation:
         low, high = points.amin(0), points.amax(0)
         margin = MARGIN * (high - low).max().clamp(min=1e-3)
         return (low - margin).tolist(), (high + margin).tolist()
-
-    # Effects
 
     def switches(self) -> list[Switch]:
         """Every effect of the plan with the settings that this model has; those without a choice say why."""

@@ -82,6 +82,21 @@ def test_trust_colours_particles_by_the_bound_of_their_error(checkpoint, scene):
     assert len(colors[~frozen].unique(dim=0)) > 1
 
 
+def test_doubt_goes_on_with_the_simulation(checkpoint, scene):
+    restored = restore(checkpoint)
+    restored.simulator.trust = Trust(2, 3, 0.5, 1.0, (-9.0, 0.0), (0.9,), ((0.01, 0.1),), {}, 3.0)
+    simulation = Simulation(restored, restored.open_scene(scene), 4)
+    straight, last = simulation.spread(simulation.parts[0]), simulation.target.particles[-1].means
+    simulation.simulate_on(3, 2)
+    assert torch.equal(simulation.target.particles[-1].means, last)
+    spread = simulation.spread(simulation.parts[-1])
+    assert bool((spread >= straight[1]).all()) and spread[:, straight[1] > 0].mean() > straight[1].mean() > 0
+    assert (simulation._bounds(4) >= simulation._bounds(3)).all()
+    simulation.simulate_on(3, 2, [Duplicate("all", (0.0, 0.0, 1.0))])
+    copied = simulation.spread(simulation.parts[-1])
+    assert copied.shape[1] > spread.shape[1] and bool((copied >= straight[1].max()).all())
+
+
 def test_bodies_are_found_and_boxes_hold_them_in_the_history(simulation):
     target = simulation.target
     for frame in (1, 3):
