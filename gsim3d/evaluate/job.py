@@ -8,6 +8,7 @@ from gsim3d.baselines import baseline
 from gsim3d.data import Scene, find_scenes, published_split, split_scenes
 from gsim3d.errors import InputError, NumericalError
 from gsim3d.evaluate import compare, trust
+from gsim3d.evaluate.physics import true_states
 from gsim3d.evaluate.pictures import write_curves
 from gsim3d.evaluate.predictions import Predictions
 from gsim3d.evaluate.protocol import check_cameras, default_views, horizon, score_scenes
@@ -88,20 +89,20 @@ def _evaluate(job: Job, metrics: tuple, not_measured: dict, against: dict | None
     n_encoded = job.given if restored is None else restored.data.history
     scenes, conditions = _open_scenes(job, restored)
     views, n_future = _views(job, restored, others, scenes, n_encoded)
-    if job.trust or job.calibrate_trust:
-        trust.check(scenes)
+    if (job.trust or job.calibrate_trust) and not any([true_states(scene) for scene in scenes]):
+        raise InputError(f"{job.data}: trust needs generated scenes, with states.npz; no scene has one")
     if job.calibrate_trust:
         if processes.is_first:
             made = trust.calibrate(restored, scenes, n_future)
             print(f"written: {trust.save_trust(folder_of(job.checkpoint), restored.checkpoint.digest, made)}")
         return
-    names, not_applicable, applied = [_name(scene, job.data) for scene in scenes], {}, []
-    for name, scene, (_, targets) in zip(names, scenes, views, strict=True):
-        applied.append([])
+    names, not_applicable = [_name(scene, job.data) for scene in scenes], {}
+    applied = [[] for _ in scenes]
+    for name, scene, (_, targets), own in zip(names, scenes, views, applied, strict=True):
         for other in others:
             try:
                 other.check(scene, targets, n_encoded, n_future)
-                applied[-1].append(other)
+                own.append(other)
             except InputError as error:
                 if other not in fitted:
                     raise
@@ -109,7 +110,7 @@ def _evaluate(job: Job, metrics: tuple, not_measured: dict, against: dict | None
     conditions |= {
         "checkpoint": None if restored is None else restored.checkpoint.digest,
         "effects": None if restored is None else restored.plan.spec.hash,
-        "predictions": {other.name: str(other.folder) for other in others if any(other in own for own in applied)},
+        "predictions": {other.name: str(other.folder) for own in applied for other in own},
         "not_applicable": not_applicable,
         "fitted": {other.name: asdict(other.config) for other in fitted},
         "data": str(job.data),

@@ -14,7 +14,7 @@ from torch import Tensor
 from gsim3d.evaluate.metrics import mean_of_counted
 from gsim3d.evaluate.perceptual.fvd import MIN_CLIPS, TREND_CLIPS, frechet_distance
 from gsim3d.evaluate.physics import MEASURES, TRUE, Measure
-from gsim3d.evaluate.scoring import METRICS, RING_WIDTH, Metric, SceneScores
+from gsim3d.evaluate.scoring import METRICS, RING_WIDTH, SceneScores
 from gsim3d.io.files import write_whole
 from gsim3d.synth.held_out import describe_set
 
@@ -99,7 +99,7 @@ def _mean_physics(scores: Sequence[SceneScores], n_future: int) -> dict:
     found = {}
     for method in dict.fromkeys(method for s in scores for method in s.physics):
         own = [s.physics[method] for s in scores if method in s.physics]
-        shared = [name for name in own[0] if all(name in one for one in own)]
+        shared = (name for name in own[0] if all(name in one for one in own))
         found[method] = {name: _numbers(torch.stack([one[name][:n_future] for one in own]).mean(0)) for name in shared}
     return found
 
@@ -115,8 +115,8 @@ def physics_table(summary: dict) -> list[str]:
     for name, measure in MEASURES.items():
         for method, values in summary["physics"].items():
             both = [values[key] for key in (name, TRUE + name) if key in values]
-            shown = (" of ".join(_digits(one[step], measure) for one in both) for step in steps)
-            lines.append(_row([measure.label, method, *shown]))
+            texts = ([_number(one[step], measure) for one in both] for step in steps)
+            lines.append(_row([measure.label, method, *map(" of ".join, texts)]))
     formulas = "; ".join(f"{name}: {measure.formula}" for name, measure in MEASURES.items())
     said = "Per unit mass, points weighted equally, v from step to step, h halfway; of: the truth of a method's points"
     return [*lines, "", f"{said}. {formulas}."]
@@ -185,8 +185,7 @@ def markdown(summary: dict, dataset: str) -> str:
     lines = [_row(["Dataset", "Method", *head]), _row(["---"] * (2 + len(head)))]
     for method in summary["methods"]:
         key = f"{_prefix(method)}future"
-        name = f"{_label(summary, method)} ({span})"
-        lines.append(_row([dataset, name, *(_with_deviation(summary, key, m) for m in shown)]))
+        lines.append(_row([dataset, f"{method} ({span})", *(_with_deviation(summary, key, m) for m in shown)]))
     by_step = [m for m in shown if METRICS[m].by_step]
     lines += ["", _row(["Horizon", "Method", *(METRICS[m].label for m in by_step)]), _row(["---"] * (2 + len(by_step)))]
     for name, part in (("given steps", "past"), ("predicted, all", "future"), ("second half", "future_late")):
@@ -215,8 +214,9 @@ def facts(summary: dict) -> list[str]:
 
 
 def notes(summary: dict) -> list[str]:
-    """Returns caveats: metrics that were not measured, and an FVD from too few clips."""
-    found = [f"{METRICS[m].label}: not measured: {reason}" for m, reason in summary["not_measured"].items()]
+    """Returns caveats: methods that are not in all scenes, metrics not measured, and an FVD from too few clips."""
+    found = [f"{m}: mean over {n} of {summary['n_scenes']} scenes" for m, n in summary["n_scenes_of"].items()]
+    found += [f"{METRICS[m].label}: not measured: {reason}" for m, reason in summary["not_measured"].items()]
     if 0 < summary.get("n_clips", 0) < TREND_CLIPS and "fvd" not in summary["not_measured"]:
         found.append(f"FVD: {summary['n_clips']} clips; with fewer than {TREND_CLIPS} it is biased and noisy")
     return found
@@ -232,8 +232,7 @@ def table(summary: dict) -> str:
         prefix = _prefix(method)
         if not any(f"{prefix}future.{m}" in summary for m in shown):
             continue
-        named = f"{_label(summary, method)}, predicted steps"
-        rows += [(named, f"{prefix}future"), ("  second half of them", f"{prefix}future_late")]
+        rows += [(f"{method}, predicted steps", f"{prefix}future"), ("  second half of them", f"{prefix}future_late")]
     width = max([34, *(len(name) + 2 for name, _ in rows)])
     lines = [
         f"{summary['n_scenes']} scenes, {summary['n_encoded_steps']} steps given, {summary['n_future_steps']} predicted"
@@ -259,12 +258,6 @@ def _prefix(method: str) -> str:
     return "" if method == "model" else f"{method}."
 
 
-def _label(summary: dict, method: str) -> str:
-    """The name of a method, and its number of scenes where it is not in all."""
-    count = summary.get("n_scenes_of", {}).get(method)
-    return method if count is None else f"{method}, {count} scene{'s' * (count > 1)}"
-
-
 def _row(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
@@ -286,9 +279,6 @@ def _numbers(values: Tensor) -> list[float | None]:
     return [None if math.isnan(value) else value for value in values.tolist()]
 
 
-def _number(value: float | None, metric: str) -> str:
-    return _digits(value, METRICS[metric])
-
-
-def _digits(value: float | None, kind: Metric | Measure) -> str:
-    return "-" if value is None else f"{value:.{kind.digits}f}"
+def _number(value: float | None, kind: str | Measure) -> str:
+    digits = METRICS[kind].digits if isinstance(kind, str) else kind.digits
+    return "-" if value is None else f"{value:.{digits}f}"

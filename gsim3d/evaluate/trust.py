@@ -44,12 +44,6 @@ def samples(scene: Scene, prediction: Prediction) -> Samples | None:
     return prediction.spread[: len(truth), moving].double().cpu().numpy(), error.numpy()
 
 
-def check(scenes: Sequence[Scene]) -> None:
-    """Raises InputError if no scene has a known motion."""
-    if not [scene for scene in scenes if true_states(scene)]:
-        raise InputError("trust: needs generated scenes, with states.npz; no scene has one")
-
-
 def collect(restored: Restored, scenes: Sequence[Scene], n_future: int) -> list[Samples]:
     """Predicts scenes with their spread; returns the samples of those with known motion. Raises InputError if there is
     none."""
@@ -161,26 +155,33 @@ def report(trust: Trust, pairs: Sequence[Samples]) -> dict:
     """How well a calibration holds on scenes: reliability, areas of risk and coverage, errors and bounds by step.
 
     "risk_coverage" ranks particles of all steps together, "within_steps" those of each step, averaged over steps; in
-    these the step alone has no order.
+    these the step alone has no order. "ratio_error": standard error over scenes (jackknife) of the areas' ratio, trust
+    over step; empty for a single scene.
     """
     _, step, error = flat(pairs)
     spreads = [torch.from_numpy(spread) for spread, _ in pairs]
     score = np.concatenate([trust.score(spread).flatten().numpy() for spread in spreads])
     bounds = {n: np.concatenate([trust.bound(spread, n).flatten().numpy() for spread in spreads]) for n in trust.levels}
     orders, steps = {"trust": score, "step": step, "perfect": error}, range(1, int(step.max()) + 1)
-    areas = {name: risk_coverage(error, by) for name, by in orders.items()}
-    within = {
-        name: float(np.mean([risk_coverage(error[step == n], by[step == n]) for n in steps]))
-        for name, by in orders.items()
-    }
+
+    def areas(kept: np.ndarray) -> dict[str, dict[str, float]]:
+        groups = {"risk_coverage": [kept], "within_steps": [kept & (step == n) for n in steps]}
+        return {
+            key: {name: float(np.mean([risk_coverage(error[k], by[k]) for k in group])) for name, by in orders.items()}
+            for key, group in groups.items()
+        }
+
+    n, scene = len(pairs), np.repeat(np.arange(len(pairs)), [one.size for _, one in pairs])
+    whole, parts = areas(scene >= 0), [areas(scene != left_out) for left_out in range(n)] if n > 1 else []
+    ratios = {key: [part[key]["trust"] / part[key]["step"] for part in parts] for key in whole if parts}
     widest = bounds[max(n for n in trust.levels if n <= 0.9)]
     return {
-        "n_scenes": len(pairs),
+        "n_scenes": n,
         "n_samples": len(error),
         "mean_error": float(error.mean()),
         "reliability": {str(n): float((error <= bound).mean()) for n, bound in bounds.items()},
-        "risk_coverage": areas,
-        "within_steps": within,
+        **whole,
+        "ratio_error": {key: float((n - 1) ** 0.5 * np.std(values)) for key, values in ratios.items()},
         "by_step": {
             "error": [float(error[step == n].mean()) for n in steps],
             "bound": [float(widest[step == n].mean()) for n in steps],
@@ -193,9 +194,10 @@ def table(found: dict) -> str:
     lines = [f"trust, {found['n_scenes']} scenes, {found['n_samples']:,} particles and steps"]
     for key, label in (("risk_coverage", "all steps together"), ("within_steps", "within steps")):
         trust, step, perfect = (found[key][name] for name in ("trust", "step", "perfect"))
+        error = f" ± {found['ratio_error'][key]:.1%}" if found["ratio_error"] else ""
         lines.append(
             f"area under the risk-coverage curve, {label}: {trust:.4f} m, by step alone {step:.4f} m "
-            f"({trust / step - 1:+.1%}), perfect {perfect:.4f} m ({perfect / step - 1:+.1%})"
+            f"({trust / step - 1:+.1%}{error}), perfect {perfect:.4f} m ({perfect / step - 1:+.1%})"
         )
     shares = ", ".join(f"{float(level):.0%}: {share:.1%}" for level, share in found["reliability"].items())
     return "\n".join([*lines, f"share of errors within the bound of each level: {shares}"])

@@ -137,6 +137,19 @@ def test_bounds_rise_and_hold_for_their_share():
         made.bound(rising, 0.77)
 
 
+def test_the_error_over_scenes_is_that_of_a_jackknife():
+    rng = np.random.default_rng(1)
+    spreads = [np.exp(rng.normal(-5, 1, (4, 30))) for _ in range(3)]
+    pairs = [(spread, spread * rng.exponential(size=(4, 30))) for spread in spreads]
+    made = made_trust(**calibration.fit_bounds(pairs))
+    found = calibration.report(made, pairs)
+    for key, error in found["ratio_error"].items():
+        parts = [calibration.report(made, pairs[:n] + pairs[n + 1 :])[key] for n in range(3)]
+        ratios = np.array([part["trust"] / part["step"] for part in parts])
+        assert error == pytest.approx(np.sqrt(2 / 3 * ((ratios - ratios.mean()) ** 2).sum())) and error > 0
+    assert calibration.table(found).count(" ± ") == 2 and calibration.report(made, pairs[:1])["ratio_error"] == {}
+
+
 def test_bounds_hold_where_scores_are_equal():
     rng = np.random.default_rng(0)
     spread, step = np.zeros((8, 500)), np.arange(1, 9)[:, None]
