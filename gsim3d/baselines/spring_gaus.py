@@ -1,9 +1,9 @@
 """Spring-Gaus: an elastic object fitted to one trajectory, as a baseline of ``gsim3d evaluate``.
 
 Isotropic Gaussians are fitted to frame 0, bound to a spring-mass system, and its initial velocity, stiffness, friction
-and softness to the first frames by rendering. As published, but for the static stage: Gaussians begin in the visual
-hull of the masks with free sizes, and are not densified, in a third of the iterations; beside the object, a ground of
-flat Gaussians is fitted.
+and softness to the first frames by rendering. As published, but for choices of our own: Gaussians begin in the visual
+hull of the masks with free sizes, and are not densified, in a third of the iterations; the velocity begins at that of
+the masks' centroids, because from 0 its rate reaches at most 0.175 m/s; beside the object, a flat ground is fitted.
 
 Source: Zhong et al. 2024, "Reconstruction and Simulation of Elastic Objects with Spring-Mass 3D Gaussians".
 """
@@ -13,6 +13,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from time import perf_counter
 
 import torch
 from torch import Tensor
@@ -24,6 +25,7 @@ from gsim3d.data import Scene
 from gsim3d.data.recording import FIXED, MOVING
 from gsim3d.errors import InputError
 from gsim3d.evaluate.metrics import ssim
+from gsim3d.evaluate.physics import GRAVITY
 from gsim3d.io.terminal import progress
 from gsim3d.ops import rasterize_gaussians
 
@@ -81,7 +83,7 @@ class SpringGaus:
 
     def __init__(self, name: str, config: SpringGausConfig, device: str = "cpu"):
         self.name, self.folder, self.config, self.device = name, "fitted", config, torch.device(device)
-        self._last: tuple = (None, None)  # key of the last fit, and the fit
+        self._last, self._seconds = (None, None), 0.0  # key of the last fit, and the fit; its seconds with images
 
     def cameras(self, scene: Scene) -> tuple[int, ...]:
         """Returns every fourth camera: the others are fitted."""
@@ -109,8 +111,10 @@ class SpringGaus:
 
     def images(self, scene: Scene, cams: list[int], n_encoded: int, n_future: int) -> Tensor:
         """Fits the scene; returns ``n_future`` steps after the first ``n_encoded``, uint8 [n_future, V, H, W, 3]."""
-        fit = self._fit(scene, cams, n_encoded)
-        return _as_bytes(fit.images(cams, range(n_encoded, n_encoded + n_future), fit.ground))
+        fit, began = self._fit(scene, cams, n_encoded), perf_counter()
+        images = _as_bytes(fit.images(cams, range(n_encoded, n_encoded + n_future), fit.ground)).cpu()
+        self._seconds = fit.seconds + perf_counter() - began
+        return images
 
     def object_images(self, scene: Scene, cams: list[int], n_encoded: int, n_future: int) -> Tensor:
         """Returns the same images of the object alone, on black."""
@@ -121,11 +125,15 @@ class SpringGaus:
         return self._fit(scene, cams, n_encoded).anchors(range(n_encoded - 1, n_encoded + n_future)).cpu()
 
     def found(self) -> dict:
-        """Returns what the last fit found, and in how many substeps a frame: friction acts in each."""
+        """Returns what the last fit found, in how many substeps a frame (friction acts in each), the number of fitted
+        values, and the seconds of its start, even if shared, its dynamics and its images."""
         fit = self._last[1]
         numbers = {"stiffness": 10 ** fit.stiffness.mean(), "grip": friction(fit._friction), "softness": fit._softness}
         found = {name: value.item() for name, value in numbers.items()}
-        return {"substeps": fit.substeps, "velocity": fit.velocity.tolist(), **found}
+        fitted = [fit.velocity, *([fit.stiffness, fit._friction, fit._softness] if fit.losses else [])]
+        fitted += [rows for splats in (fit.object, fit.ground) for rows in splats.rows.values()]
+        facts = {"substeps": fit.substeps, "parameters": sum(map(torch.numel, fitted)), "seconds": self._seconds}
+        return {**facts, "velocity": fit.velocity.tolist(), **found}
 
     def _fit(self, scene: Scene, cams: Sequence[int], n_encoded: int) -> Fit:
         wanted = self.config.fit_frames
@@ -160,10 +168,11 @@ class Fit:
         stiffness: log10 of each anchor's, [N].
         losses: losses of the dynamic stage, means over a pass.
         substeps: of a frame, at the end.
+        seconds: that the stages took.
     """
 
     def __init__(self, scene: Scene, cams: Sequence[int], count: int, config: SpringGausConfig, device: torch.device):
-        self.scene, self.config, self.device, self._cams = scene, config, device, cams
+        self.scene, self.config, self.device, self._cams, began = scene, config, device, cams, perf_counter()
         self.height, self.substeps, self.losses = scene.ground_height or 0.0, config.substeps, []
         self._load(count)
         labels = scene.segmentation(cams, [0]).to(device)[0] != MOVING
@@ -184,6 +193,7 @@ class Fit:
         self._fit_velocity(rest - self._bound(self.springs.rest))
         self.object.rows["means"] = self._bound(self.springs.rest).requires_grad_()
         self._fit_appearance("bound appearance", config.refine_iterations, 0.05, APPEARANCE)
+        self.seconds = perf_counter() - began
 
     def _load(self, count: int) -> None:
         """Reads the first ``count`` frames: cameras, and images of the object on black."""
@@ -195,7 +205,6 @@ class Fit:
 
     def _start_parameters(self) -> None:
         n, device = len(self.springs.rest), self.device
-        self.velocity = torch.zeros(3, device=device, requires_grad=True)
         self.stiffness = torch.full((n,), self.config.stiffness, device=device).log10().requires_grad_()
         self._friction = torch.tensor(-1.0, device=device, requires_grad=True)
         self._softness = torch.zeros((), device=device, requires_grad=True)
@@ -237,6 +246,7 @@ class Fit:
 
     def _fit_velocity(self, offset: Tensor) -> None:
         """Gaussians move from where they began, ``offset`` from the mean of their anchors."""
+        self.velocity = self._seen_velocity().requires_grad_()
         adam = torch.optim.Adam([self.velocity], lr=1e-3, **ADAM)
         halve = torch.optim.lr_scheduler.StepLR(adam, 100, 0.5)
         with progress(None, "velocity", self.config.velocity_iterations, unit="pass") as bar:
@@ -245,9 +255,19 @@ class Fit:
                 bar.update()
         self.velocity = self.velocity.detach()
 
+    def _seen_velocity(self) -> Tensor:
+        """Velocity [3] m/s by which the centre of the masks falls freely from first to last frame; 0 if unknown."""
+        masks = [self._objects[frame].amax(-1) > 0 for frame in (0, -1)]
+        seen = (masks[0].flatten(1).any(1) & masks[1].flatten(1).any(1)).nonzero()[:, 0]
+        seconds = (len(self._cameras) - 1) / self.scene.fps
+        if seconds == 0 or len(seen) < 2:
+            return torch.zeros(3, device=self.device)
+        first, last = (_centre(self._cameras[frame], masks[frame], seen) for frame in (0, -1))
+        return (last - first) / seconds + first.new_tensor([0, 0, GRAVITY * seconds / 2])
+
     def with_dynamics(self, count: int, config: SpringGausConfig) -> Fit:
         """Returns a fit of stiffness, friction and softness to the first ``count`` frames; this one stays as it is."""
-        fit = copy.copy(self)
+        fit, began = copy.copy(self), perf_counter()
         fit.config, fit.object, fit.losses = config, self.object.copy(), []
         fit._load(count)
         fit._start_parameters()
@@ -262,6 +282,7 @@ class Fit:
                 _step(late, fit._loss(0, fit.object.rows["means"], 0.05))
                 bar.update()
         fit._rolled = [SpringState(self.springs.rest, torch.zeros_like(self.springs.rest))]
+        fit.seconds += perf_counter() - began
         return fit
 
     def _pass(self, share, adam, schedule, *, damping: float, soft: bool = True, offset: Tensor | float = 0) -> float:
@@ -347,6 +368,15 @@ def _extent(cameras: Cameras) -> float:
     """1.1 times the largest distance of a camera from the mean of all."""
     centers = -(cameras.viewmats[:, :3, :3].mT @ cameras.viewmats[:, :3, 3:])[..., 0]
     return 1.1 * float((centers - centers.mean(0)).norm(dim=1).max())
+
+
+def _centre(cameras: Cameras, masks: Tensor, seen: Tensor) -> Tensor:
+    """The point [3] nearest to the rays through the centroids of the masks [I, H, W] of the cameras ``seen``."""
+    pixels = torch.stack([mask.nonzero().flip(1).float().mean(0) + 0.5 for mask in masks[seen]])
+    poses = torch.linalg.inv(cameras.viewmats[seen])
+    rays = poses[:, :3, :3] @ torch.linalg.solve(cameras.Ks[seen], F.pad(pixels, (0, 1), value=1))[..., None]
+    across = torch.eye(3, device=rays.device) - rays @ rays.mT / rays.square().sum(1, keepdim=True)
+    return (torch.linalg.pinv(across.sum(0), hermitian=True) @ (across @ poses[:, :3, 3:]).sum(0))[:, 0]
 
 
 def _as_bytes(images: Tensor) -> Tensor:

@@ -32,6 +32,7 @@ COLUMNS = {  # key of the numbers -> title, decimals
     "encode_ms": ("ms to encode", 1),
     "step_ms": ("ms a step", 2),
     "steps_a_second": ("steps a second", 1),
+    "seconds": ("s to fit", 1),
     "parameters": ("parameters", 0),
     "substeps": ("substeps a frame", 0),
     "shape_cm": ("shape, cm", 2),
@@ -47,8 +48,8 @@ scenes; "=" marks differences within {LEAST:g} of them. Last: change of masked P
 before in this folder. Edits: shape is the rms distance to the best rigid motion over all steps, of the worst copy; fall
 without ground over free fall, after 20 steps; above the raised ground: the lowest twentieth of the body at the end.
 Paper: other data, which was never released, and other budgets: compare differences, not values.
-Cost: all seconds of a row, with scoring. "ms a step" includes rendering; a method that is fitted to each scene has its
-cost instead."""
+Cost: all seconds of a row, with scoring. "ms a step" includes rendering; "s to fit" of a method that is fitted to each
+scene are those of its start, dynamics and images. Parameters: weights, or fitted values; baselines add none."""
 
 
 @dataclass
@@ -80,8 +81,9 @@ def write(out: Path, rows: Sequence[Row], about: dict) -> tuple[dict, list[Path]
         if table == MAIN:
             speeds = [row for row in rows if (row.table, row.world) == (SPEED, world) and row.cells]
             times = {row.model: _numbers(row.cells, "")[0] for row in speeds}
-            for line in (line for line in own if line.label in times):
-                line.numbers |= {key: times[line.label][key] for key in ("step_ms", "parameters")}
+            for line in own:
+                found = times.get(line.label, {"parameters": 0} if line.label in METHODS else {})
+                line.numbers |= {key: found[key] for key in ("step_ms", "parameters") if key in found}
         pictures = _figures(out / "figures", table, world, own)
         parts += [f"## {table}: {world}", _table(own), _remarks(own) if table == MAIN else ""]
         parts += [f"![{path.stem}](figures/{path.name})" for path in pictures]
@@ -141,8 +143,9 @@ def _numbers(cells: dict[str, dict], method: str) -> tuple[dict, dict, dict]:
         return first["numbers"], first.get("by_scene", {"": first["numbers"].get("step_ms")}), {}
     own = {scene: result["scores"] for scene, result in results.items()}
     summary = summarize([from_json({**scores, "scene": scene}, method or "model") for scene, scores in own.items()])
-    if found := [fit["substeps"] for scene in summary["scenes"].values() for fit in scene.get("fitted", {}).values()]:
-        summary["substeps"] = statistics.fmean(found)
+    fits = [fit for scene in summary["scenes"].values() for fit in scene.get("fitted", {}).values()]
+    for key in ("substeps", "seconds", "parameters") if fits else ():
+        summary[key] = statistics.fmean(fit[key] for fit in fits)
     head = "psnr_masked" if "future.psnr_masked" in summary else "psnr"
     by_scene = {scene: scores.get(f"future.{head}") for scene, scores in summary["scenes"].items()}
     by_scene = {} if method.endswith(ALONE) else by_scene  # the others are of whole images
@@ -233,10 +236,9 @@ def _figures(folder: Path, table: str, world: str, lines: Sequence[Line]) -> lis
 
 
 def _seconds(line: Line) -> float | None:
-    """Seconds a predicted step: of a model measured alone, of a fitted method its whole cost; None if unknown."""
-    if not line.row.model:
-        cost = statistics.fmean(cell["seconds"] for cell in line.row.cells.values())
-        return cost / line.summary["n_future_steps"]
+    """Seconds a predicted step: of a model measured alone, of a fitted method those of its fit; None if unknown."""
+    if "seconds" in line.numbers:
+        return line.numbers["seconds"] / line.summary["n_future_steps"]
     return line.numbers["step_ms"] / 1e3 if "step_ms" in line.numbers else None
 
 

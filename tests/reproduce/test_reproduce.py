@@ -69,6 +69,7 @@ def test_every_row_that_the_data_allow(first, work):
     assert {("Speed", "one"), ("Edits", "two"), ("History length at inference", "two, history 1")} <= lines.keys()
     assert lines[MAIN, "one"]["paper_other_data"] == "33.15 ± 3.51" and not lines[MAIN, "copy"]["paper_other_data"]
     assert lines[MAIN, "two"]["numbers"]["step_ms"] == lines["Speed", "two"]["numbers"]["step_ms"] > 0
+    assert lines[MAIN, "two"]["numbers"]["parameters"] > lines[MAIN, "constant"]["numbers"]["parameters"] == 0
     assert {"shape_cm", "copies_cm", "above_cm"} == lines["Edits", "one"]["numbers"].keys()  # too short for a fall
     page, missing = (work / "out" / "reproduce.md").read_text(), " ".join(content["missing"])
     for text in ("momentum [m/s] | two", "other data", "(figures/main-table-elastic-curves.png)"):
@@ -169,10 +170,18 @@ def test_fitted_methods_are_rows(work, tmp_path, monkeypatch, no_curves):
     _, lines, _ = made(work, tmp_path / "out", trajectories=1)
     row = lines[MAIN, "spring-gaus"]
     assert row["numbers"]["future.psnr_masked"] > 10 and row["seed"] is None
-    assert row["numbers"].keys() - lines[MAIN, "copy"]["numbers"].keys() == {"substeps"}
+    assert row["numbers"].keys() - lines[MAIN, "copy"]["numbers"].keys() == {"substeps", "seconds"}
+    assert row["numbers"]["parameters"] > 8 * 64**2 and lines[MAIN, "copy"]["numbers"]["parameters"] == 0
+    cell = json.loads(
+        next((tmp_path / "out" / "cells" / "Main-table" / "elastic" / "spring-gaus").iterdir()).read_text()
+    )
+    assert 0 < row["numbers"]["seconds"] < cell["seconds"]  # that of scoring does not count
+    found = page.Line(None, "", row["numbers"], {}, {"n_future_steps": 4})
+    assert page._seconds(found) == row["numbers"]["seconds"] / 4
     assert row["numbers"]["substeps"] >= 5 and "| substeps a frame |" in (tmp_path / "out" / "reproduce.md").read_text()
     alone = lines[MAIN, "spring-gaus-object"]
-    assert {"future.psnr", "future.ssim", "substeps"} == alone["numbers"].keys() and not alone["by_scene"]
+    fitted = {"substeps", "seconds", "parameters"}
+    assert {"future.psnr", "future.ssim", *fitted} == alone["numbers"].keys() and not alone["by_scene"]
 
 
 @pytest.mark.parametrize(
@@ -206,5 +215,5 @@ def test_a_shipped_simulator_in_three_minutes(tmp_path):
     model, still = lines[MAIN, "elastic-small"], lines[MAIN, "constant"]
     assert model["future.psnr_body"] > still["future.psnr_body"] + 2 and model["step_ms"] > 0
     cell = json.loads(next((tmp_path / "cells" / "Main-table").rglob("*.json")).read_text())["result"]["scores"]
-    fall = {name: values["momentum"] for name, values in cell["physics"].items()}  # of free fall
-    assert fall["model"] == pytest.approx(fall["truth"], rel=0.1) and fall["truth"][-1] > fall["truth"][0] > 0.5
+    fall, true = (cell["physics"]["model"][name] for name in ("momentum", "true momentum"))  # of free fall
+    assert fall == pytest.approx(true, rel=0.1) and true[-1] > true[0] > 0.5
