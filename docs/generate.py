@@ -235,8 +235,9 @@ def trust() -> str:
         for key, label in (("risk_coverage", "all steps"), ("within_steps", "within steps")):
             areas = [found[key][by] for by in ("trust", "step", "perfect")]
             counts = found["n_scenes"], f"{found['n_samples']:,}", f"{found['mean_error']:.4f}"
-            numbers = [f"{area:.4f}" for area in areas]
-            rows.append((f"{name}, {label}", *counts, *numbers, f"{areas[0] / areas[1] - 1:+.1%}"))
+            numbers, error = [f"{area:.4f}" for area in areas], found.get("ratio_error", {}).get(key)
+            difference = f"{areas[0] / areas[1] - 1:+.1%}" + ("" if error is None else f" ± {error:.1%}")
+            rows.append((f"{name}, {label}", *counts, *numbers, difference))
     areas = table(head, rows)
     levels = list(results["sets"]["validation"]["reliability"])
     rows = [(name, *(f"{s:.0%}" for s in found["reliability"].values())) for name, found in results["sets"].items()]
@@ -246,8 +247,25 @@ def trust() -> str:
         for name, found in results["detection"].items()
     ]
     detected = table(("inputs", "number", "announced", "measures out of range (inputs)"), rows)
-    titles = "## Risk and coverage", "## Reliability", "## Unfamiliar inputs"
-    return "\n".join(f"{title}\n\n{text}" for title, text in zip(titles, (areas, shares, detected), strict=True))
+    totals: dict[str, list[int]] = {}
+    for name, found in results["detection"].items():
+        kind = totals.setdefault(name if name in results["sets"] else name.partition(",")[0], [0, 0])
+        kind[:] = kind[0] + found["announced"], kind[1] + found["scenes"]
+    rows = [
+        (kind, f"{n} of {of}", f"{n / of:.0%}", "{:.0%} to {:.0%}".format(*wilson(n, of)))
+        for kind, (n, of) in totals.items()
+    ]
+    kinds = table(("inputs", "announced", "share", "95 % interval"), rows)
+    titles = "## Risk and coverage", "## Reliability", "## Unfamiliar inputs", "## Unfamiliar inputs by kind"
+    parts = areas, shares, detected, kinds
+    return "\n".join(f"{title}\n\n{text}" for title, text in zip(titles, parts, strict=True))
+
+
+def wilson(count: int, total: int) -> tuple[float, float]:
+    """Interval of a share that is known from ``count`` of ``total``, at 95 % (Wilson)."""
+    square = 1.96**2 / total
+    middle, half = count / total + square / 2, (square * (count / total * (1 - count / total) + square / 4)) ** 0.5
+    return max(0.0, (middle - half) / (1 + square)), min(1.0, (middle + half) / (1 + square))
 
 
 def model_names() -> list[str]:

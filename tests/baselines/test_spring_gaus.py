@@ -120,7 +120,7 @@ def test_a_shared_start_counts_for_each(data, quick, monkeypatch):
     for name, config in list(baselines.BASELINES.items()):
         monkeypatch.setitem(baselines.BASELINES, name, dataclasses.replace(config, **given))
     monkeypatch.setattr(spring_gaus, "perf_counter", lambda: next(clock))
-    for name in ("spring-gaus", "spring-gaus-all"):  # the second has the start of the first
+    for name in ("spring-gaus", "spring-gaus-given"):  # the second has the start of the first
         method = baseline(name)
         method.images(scene, cams, 4, 1)
         method.object_images(scene, cams, 4, 1)

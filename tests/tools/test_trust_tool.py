@@ -40,6 +40,7 @@ def test_figure_and_page(tmp_path, monkeypatch):
     made = Trust(n_scenes=1, n_steps=4, ranges={}, threshold=3.0, **trust.fit_bounds(pairs))
     sets = {name: trust.report(made, pairs) for name in ("validation", "test")}
     results = {"sets": sets, "detection": {"test": {"scenes": 4, "announced": 1, "measures": {"near depth": 1}}}}
+    results["detection"] |= {f"size, {n}": {"scenes": 3, "announced": n, "measures": {}} for n in (1, 2)}
     draw(tmp_path / "trust.png", results, made, {"test": pairs})
     assert (tmp_path / "trust.png").stat().st_size > 10_000
     (tmp_path / "elastic-small.trust.json").write_text(json.dumps(results))
@@ -49,6 +50,13 @@ def test_figure_and_page(tmp_path, monkeypatch):
     monkeypatch.setattr(pages, "RESULTS", tmp_path)
     page = pages.trust()
     assert "| test | 4 | 1 | near depth (1) |" in page and "| validation, within steps | 1 | 200 |" in page
+    assert "| test | 1 of 4 | 25% | 5% to 70% |" in page and pages.wilson(6, 8) == pytest.approx(
+        (0.4093, 0.9285), abs=1e-4
+    )
+    assert "| size | 3 of 6 | 50% |" in page and "±" not in page
+    sets["test"] = trust.report(made, pairs * 2)
+    (tmp_path / "elastic-small.trust.json").write_text(json.dumps(results))
+    assert pages.trust().count("% ± ") == 2
 
 
 def test_any_weights_are_calibrated_and_go_on_with_their_own(tmp_path, monkeypatch, capsys):
