@@ -101,8 +101,8 @@ def test_speed_is_read_beside_the_weights(folder):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"steps": 0}, "steps must be an integer of at least 1; got 0"),
-        ({"steps": 1.5}, "steps must be an integer of at least 1; got 1.5"),
+        ({"steps": 0}, "steps must be a whole number of at least 1; got 0"),
+        ({"steps": 1.5}, "steps must be a whole number of at least 1; got 1.5"),
         ({"source": "data/ball/0000"}, r"source must be a scene \(gsim3d.data.Scene.open.*got str"),
         ({"cameras": [0]}, r"cameras must be Cameras.*got \[0\]"),
         (

@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from gsim3d.cuda_graphs import Prediction
 from gsim3d.effects.edits import Edit
 from gsim3d.effects.plan import Plan
 from gsim3d.effects.spec import EffectsSpec, Sleep
-from gsim3d.errors import InputError, check_one_of, check_ranges
+from gsim3d.errors import InputError, check_one_of, check_ranges, check_whole
 from gsim3d.io.files import shown
 from gsim3d.io.settings import from_dict
 from gsim3d.numerics.trust import MOST_LEFT_OUT, check_input, read_checkpoints, without_oldest
@@ -182,8 +181,7 @@ def predict(
     **options: Any,
 ) -> Prediction:
     """:meth:`gsim3d.Simulator.predict` under the simulator's setting; ``options`` go to the rollout."""
-    if not isinstance(steps, Integral) or steps < 1:
-        raise InputError(f"predict: steps must be an integer of at least 1; got {steps!r}")
+    check_whole("predict: steps", steps)
     if not isinstance(cameras, Cameras | None):
         raise InputError(f"predict: cameras must be Cameras, such as scene.cameras_at([0], [0]); got {shown(cameras)}")
     state = source if isinstance(source, Particles) else encode(simulator, source)

@@ -22,9 +22,7 @@ def row_scenes(cloud_scene: Tensor, cu_input: Tensor, stages: Sequence[Segments]
     Returns:
         int64 [M] for each stage; 0 for rows that pool none.
     Gradients:
-        none.
-    Determinism:
-        integers.
+        none, since results are integers.
     Raises:
         ValueError, TypeError: a shape, a dtype or a device does not fit; the message names the argument.
 
@@ -49,9 +47,7 @@ def find_cells(cells: Tensor, scene: Tensor, grid: Tensor) -> Tensor:
     Returns:
         int64 [N], D - 1 for rows whose cell is not in the list.
     Gradients:
-        none.
-    Determinism:
-        integers.
+        none, since results are integers.
     Raises:
         ValueError, TypeError: a shape, a dtype or a device does not fit; the message names the argument.
 
@@ -112,9 +108,7 @@ def overlapping_patches(
     Returns:
         One table a curve, of P + N // patch_size patches. A row of a scene without patches is in none.
     Gradients:
-        none.
-    Determinism:
-        integers.
+        none, since results are integers.
     Raises:
         ValueError, TypeError: a shape, a dtype, a device or, on the CPU, an entry does not fit; the message names the
             argument.

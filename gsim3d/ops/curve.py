@@ -39,9 +39,7 @@ def curve_encode(
     Returns:
         int64 [N], or [R, N] for R curves. On CUDA a row whose cell or cloud is out of range has code 0.
     Gradients:
-        none.
-    Determinism:
-        integers.
+        none, since results are integers.
     Raises:
         ValueError: depth or shift is out of range or, on the CPU, a cell or a cloud; the message names row and axis.
     Source:
@@ -77,9 +75,7 @@ def curve_sort(codes: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         order, inverse: int64 [R, N]; on CUDA N is below 2^30.
     Gradients:
-        none.
-    Determinism:
-        integers.
+        none, since results are integers.
 
     Example:
         >>> curve_sort(torch.tensor([[30, 10, 20]]))
@@ -427,9 +423,9 @@ def build_pyramid(
         Pyramid; tensors int64 on the device of ``positions``. On CUDA the call waits once, for the sizes; with
         ``capacity`` never: a CUDA graph can capture it, and ``Pyramid.found`` tells later whether the data fitted.
     Gradients:
-        none.
+        none, since results are integers.
     Determinism:
-        integers. The order of the rows of a cloud permutes the results only.
+        the order of the rows of a cloud permutes the results only.
     Raises:
         ValueError: an argument is malformed; the message names it. With ``capacity`` on CUDA, malformed clouds give an
             empty pyramid instead, see :meth:`PyramidCapacity.fits`.
