@@ -19,13 +19,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from gsim3d.baselines.spring_mass import Springs, SpringState, advance_safely, bind, build_springs, friction, softness
+from gsim3d.baselines.spring_mass import GRAVITY, SpringState, advance_safely, bind, build_springs, friction, softness
 from gsim3d.cameras import Cameras
 from gsim3d.data import Scene
 from gsim3d.data.recording import FIXED, MOVING
 from gsim3d.errors import InputError
 from gsim3d.evaluate.metrics import ssim
-from gsim3d.evaluate.physics import GRAVITY
 from gsim3d.io.terminal import progress
 from gsim3d.ops import rasterize_gaussians
 
@@ -186,7 +185,7 @@ class Fit:
         self._fit_appearance("static", config.static_iterations, 0.2, RATES | {"means": extent * RATES["means"]})
         rest = self.object.rows["means"].detach()
         options = {"n_anchors": config.anchors, "n_neighbors": config.neighbors, "edge": config.edge}
-        self.springs: Springs = build_springs(rest, **options, seed=config.seed)
+        self.springs = build_springs(rest, **options, seed=config.seed)
         self._indices, self._weights = bind(rest, self.springs.rest)
         self._start_parameters()
         self._fit_appearance("appearance", config.refine_iterations, 0.2, APPEARANCE)

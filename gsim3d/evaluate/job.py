@@ -71,7 +71,7 @@ def evaluate(job: Job) -> None:
     if job.context and (job.trust or job.calibrate_trust):
         raise InputError("--context cannot be combined with --trust or --calibrate-trust")
     if job.calibrate_trust and folder_of(job.checkpoint).resolve().is_relative_to(FOLDER.resolve()):
-        raise InputError(f"--calibrate-trust: {job.checkpoint} is part of the package; copy its folder, and give that")
+        raise InputError(f"--calibrate-trust: {job.checkpoint} is of the package; give model.safetensors of a copy")
     with joined(job.device) as processes:
         _evaluate(job, metrics, not_measured, other, processes)
 

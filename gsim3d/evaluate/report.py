@@ -215,7 +215,8 @@ def facts(summary: dict) -> list[str]:
 
 def notes(summary: dict) -> list[str]:
     """Returns caveats: methods that are not in all scenes, metrics not measured, and an FVD from too few clips."""
-    found = [f"{m}: mean over {n} of {summary['n_scenes']} scenes" for m, n in summary["n_scenes_of"].items()]
+    some = summary.get("n_scenes_of", {})
+    found = [f"{method}: mean over {n} of {summary['n_scenes']} scenes" for method, n in some.items()]
     found += [f"{METRICS[m].label}: not measured: {reason}" for m, reason in summary["not_measured"].items()]
     if 0 < summary.get("n_clips", 0) < TREND_CLIPS and "fvd" not in summary["not_measured"]:
         found.append(f"FVD: {summary['n_clips']} clips; with fewer than {TREND_CLIPS} it is biased and noisy")

@@ -1,12 +1,11 @@
 """A graph network over packed point clouds of several time steps, in place of the point transformer.
 
-The particles of a step that share a cell of the grid are one node, at their mean position. To each node of the newest
-step lead edges from all nodes in its cell and those around: in a first round of message passing from those of earlier
-steps, in later rounds from those of the newest. Positions enter as differences only. A voxel graph, no radius graph: it
-is invariant to translation by whole cells only (untrained, a quarter of a cell changes displacements by 0.20 of them).
+A voxel graph: the particles of a step that share a cell of the grid are one node, at their mean position. To each node
+of the newest step lead edges from all nodes in its cell and those around: in a first round of message passing from
+earlier steps, in later rounds from the newest. Positions enter as differences only; invariant to translation by whole
+cells only (untrained, a quarter of a cell changes displacements by 0.20 of them).
 Source:
-    Graph Network-based Simulators (Sanchez-Gonzalez et al. 2020), with the interaction of nodes and edges of Battaglia
-    et al. 2018.
+    Graph Network-based Simulators (Sanchez-Gonzalez et al. 2020); nodes and edges interact as of Battaglia et al. 2018.
 """
 
 from __future__ import annotations
