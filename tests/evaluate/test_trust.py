@@ -265,7 +265,7 @@ def test_what_trust_needs_is_checked_before_scoring(work, tmp_path, capsys, monk
         assert main([*evaluate, option, "--context", "0", "1"]) == 2
         assert "--context cannot be combined" in capsys.readouterr().err
     shipped = ["evaluate", "elastic-small", str(work / "data"), "--calibrate-trust"]
-    assert main(shipped) == 2 and "elastic-small is part of the package" in capsys.readouterr().err
+    assert main(shipped) == 2 and "elastic-small is of the package" in capsys.readouterr().err
     monkeypatch.setattr(job, "score_scenes", write)
     write_states(tmp_path / "data" / "ball" / "0001")
     assert main([*evaluate, "--trust"]) == 2 and "nothing moves" in capsys.readouterr().err
