@@ -14,7 +14,7 @@ import numpy as np
 
 from gsim3d.data import recording
 from gsim3d.data.actions import MAX_BYTES, UNREADABLE
-from gsim3d.data.cameras import check_intrinsics, check_pose, inverse, project
+from gsim3d.data.cameras import check_intrinsics, check_pose, depth_range, inverse, project
 from gsim3d.data.images import as_color, as_mask, read_files
 from gsim3d.data.recording import (
     FIXED,
@@ -79,10 +79,11 @@ def read(folder: Path, problems: Problems) -> Recording:
 
 
 def _depths(viewmats: np.ndarray) -> tuple[float, float]:
-    """Returns the smallest and largest depth of the workspace's corners in all cameras."""
+    """Returns the smallest and largest depth of the workspace's corners in all cameras, near not below the usual guess:
+    particles right before their own camera are seen by no other, and get no gradient from the others' images."""
     corners = np.array([[WORKSPACE[k >> axis & 1][axis] for axis in range(3)] for k in range(8)])
     depths = corners @ viewmats[:, 2, :3].T + viewmats[:, 2, 3]
-    near = max(MIN_NEAR, float(depths.min()))
+    near = max((depth_range(viewmats) or (MIN_NEAR,))[0], float(depths.min()))
     return near, max(2 * near, float(depths.max()))
 
 

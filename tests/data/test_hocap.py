@@ -50,6 +50,10 @@ def test_cameras_are_world_to_camera_with_pixel_centres_at_a_half(scene):
     np.testing.assert_allclose(Ks[1] - intrinsics(1), [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], atol=1e-9)
 
 
+def test_particles_do_not_begin_right_before_their_own_camera(scene):
+    assert 0.3 < scene.near < 0.6 and scene.far > 1.5  # cameras are 1.1 m from the table's centre
+
+
 def test_box_of_known_pose_is_where_images_and_labels_show_it(scene, folder):
     for frame in (0, 13):
         corners = BOX @ box_pose(frame)[:3, :3].T + box_pose(frame)[:3, 3]
@@ -246,18 +250,30 @@ def test_damaged_calibration_and_labels_are_refused_by_file(tmp_path):
         Scene.open(folder).images([1], [1])
 
 
-def test_documented_training_runs_on_the_sequence(tmp_path):
+def train_as_documented(folder, steps):
     """The configuration as documented, with a small model and few steps; its settings of data and actions are kept."""
     root = Path(__file__).parent.parent.parent
     for number in range(2):
-        write_hocap(tmp_path / "data" / str(number), gaps=False, n_frames=20)
+        write_hocap(folder / "data" / str(number), gaps=False, n_frames=20)
     config = yaml.safe_load((root / "configs" / "train" / "hocap.yaml").read_text())
-    config |= {"preset": "tiny", "captured": False, "precision": {}, "phases": [{"steps": 2, "horizon": 2}]}
+    config |= {"preset": "tiny", "captured": False, "precision": {}, "phases": [{"steps": steps, "horizon": 2}]}
     config["model"] = {"dynamics": {"actions": config["model"]["dynamics"]["actions"], "zero_init": False}}
     config["data"] |= {"resize": [64, 48], "context_cameras": [0, 1, 2], "history": 2}
-    (tmp_path / "train.yaml").write_text(yaml.safe_dump(config))
-    arguments = [str(tmp_path / "train.yaml"), "--data", str(tmp_path / "data"), "--out", str(tmp_path / "run")]
+    (folder / "train.yaml").write_text(yaml.safe_dump(config))
+    arguments = [str(folder / "train.yaml"), "--data", str(folder / "data"), "--out", str(folder / "run")]
     assert main(["train", *arguments]) == 0
+
+
+@pytest.mark.slow
+def test_documented_training_of_120_steps_lowers_the_loss(tmp_path):
+    train_as_documented(tmp_path, 120)
+    entries = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
+    assert entries[-1]["step"] == 119 and not any("skipped" in entry for entry in entries)
+    assert entries[-1]["loss"] < 0.3 * entries[0]["loss"]
+
+
+def test_documented_training_runs_on_the_sequence(tmp_path):
+    train_as_documented(tmp_path, 2)
     restored = restore(tmp_path / "run")
     scene = restored.open_scene(find_scenes(tmp_path / "data")[0])
     prediction = predict(restored, scene, [0, 1, 2], 6)
