@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,9 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gsim3d.capture.check import angles
+from gsim3d.capture.check import SAMPLES, angles, moving_bodies
 from gsim3d.data import Scene
-from gsim3d.data.cameras import nearest_point, positions_and_axes
 from gsim3d.data.fitting import Fitting, frame_stride, scale_colors, scale_labels
 from gsim3d.data.recording import BACKGROUND, MOVING, evenly_spaced
 from gsim3d.data.scene import SIZE_MULTIPLE
@@ -25,7 +23,6 @@ SIDES = {"cpu": 64, "cuda": 128}  # pixels, longer side of the images that a mod
 PARTICLES = {"cpu": 1500, "cuda": 12_000}  # of a step
 PRESETS = {"cpu": "tiny", "cuda": "small"}
 HISTORY = {"cpu": 2, "cuda": 4}
-SAMPLES = 24  # steps of a take at which masks are looked at
 MARGIN = 0.15  # around the moving bodies, of the size of their box
 MOST = 0.95  # of the pixels of a mask, and of the steps, that the box around moving bodies encloses
 DEPTH_MARGINS = (0.85, 1.15)  # around the depths of the moving bodies
@@ -59,8 +56,8 @@ def open_take(folder: Path, cache: Path) -> Scene:
 def propose(takes: Sequence[Scene], device: str, say: Callable[[str], None]) -> Proposal:
     """Decides how the takes of a capture are prepared, and says why."""
     first = takes[0]
-    if any(frame_stride(take.fps, first.fps) != 1 or take.n_cams != first.n_cams for take in takes):
-        raise InputError("the takes differ in frame rate or number of cameras; capture them in folders of their own")
+    if any(frame_stride(take.fps, first.fps) != 1 for take in takes):
+        raise InputError("the takes differ in frame rate; capture them in folders of their own")
     say(f"  rate: {first.fps:g} frames a second, nearest to {WANTED_FPS:g}: steps large enough to see motion")
     has_masks = all(take.has_segmentation() for take in takes)
     sizes = first.recording.sizes
@@ -126,33 +123,25 @@ def _depths(takes: Sequence[Scene]) -> tuple[float, float] | None:
 
     Of spheres around the point nearest to the rays through the masks' centroids, which stretch less than visual hulls.
     """
-    viewmats, Ks = takes[0].recording.cameras_at_step(0)
-    centres, _ = positions_and_axes(viewmats)
     depths = []
     for take in takes:
-        for step in evenly_spaced(take.n_steps, SAMPLES):
-            masks = (take.segmentation(range(take.n_cams), [step])[0] == MOVING).numpy()
-            seen = np.flatnonzero(masks.any((1, 2)))
-            pixels = [np.argwhere(masks[cam])[:, ::-1] + 0.5 for cam in seen]
-            middles = np.array([[*own.mean(0), 1] for own in pixels])
-            rays = [viewmats[c, :3, :3].T @ np.linalg.solve(Ks[c], middle) for c, middle in zip(seen, middles)]
-            point = nearest_point(centres[seen], np.array(rays)) if len(seen) > 1 else None
-            if point is not None:
-                depth = viewmats[seen, 2, :3] @ point + viewmats[seen, 2, 3]
-                spans = [np.quantile(np.linalg.norm(own - m[:2], axis=1), MOST) for own, m in zip(pixels, middles)]
-                radius = np.median(np.array(spans) * depth / Ks[seen, 0, 0])
-                depths.append((depth.min() - radius, depth.max() + radius))
+        viewmats, Ks = take.recording.cameras_at_step(0)
+        for found in filter(None, (moving_bodies(take, step) for step in evenly_spaced(take.n_steps, SAMPLES))):
+            seen, pixels, middles, point = found
+            depth = viewmats[seen, 2, :3] @ point + viewmats[seen, 2, 3]
+            spans = [np.quantile(np.linalg.norm(own - m, axis=1), MOST) for own, m in zip(pixels, middles)]
+            radius = np.median(np.array(spans) * depth / Ks[seen, 0, 0])
+            depths.append((depth.min() - radius, depth.max() + radius))
     if not depths:
         return None
     near, far = (float(np.quantile([d[end] for d in depths], q)) for end, q in ((0, 1 - MOST), (1, MOST)))
     return (DEPTH_MARGINS[0] * near, DEPTH_MARGINS[1] * far) if near > 0 else None
 
 
-def write_scene(take: Scene, proposal: Proposal, steps: Sequence[int], folder: Path) -> Path:
+def write_scene(take: Scene, proposal: Proposal, steps: Sequence[int], folder: Path) -> None:
     """Writes consecutive ``steps`` of a take of :func:`open_take` as a scene of the layout videos, which appears
     complete: cropped, scaled and undistorted as proposed, with labels."""
     unfinished = folder.with_name(f".{folder.name}")
-    shutil.rmtree(unfinished, ignore_errors=True)
     viewmats, Ks = take.recording.cameras_at_step(0)
     cameras = []
     for cam, (name, crop) in enumerate(zip(take.camera_names, proposal.crops, strict=True)):
@@ -166,21 +155,16 @@ def write_scene(take: Scene, proposal: Proposal, steps: Sequence[int], folder: P
             if (valid := take.valid([cam], [step])) is not None:
                 labels = np.where(valid[0, 0].numpy(), labels, BACKGROUND)
             file = f"{name}/{number:05d}.png"
-            image, labels = (
-                f(_cropped(x, crop), proposal.size) for f, x in ((scale_colors, image), (scale_labels, labels))
-            )
-            cv2.imwrite(str(unfinished / file), image[..., ::-1])
-            cv2.imwrite(str(unfinished / "labels" / file), labels)
+            small = scale_colors(_cropped(image, crop), proposal.size)
+            cv2.imwrite(str(unfinished / file), small[..., ::-1])
+            cv2.imwrite(str(unfinished / "labels" / file), scale_labels(_cropped(labels, crop), proposal.size))
         scale = np.diag([proposal.size[0] / crop[2], proposal.size[1] / crop[3], 1.0])
         K = scale @ (Ks[cam] - [[0, 0, crop[0]], [0, 0, crop[1]], [0, 0, 0]])
-        R, T = viewmats[cam, :3, :3], viewmats[cam, :3, 3]
-        pose = {"K": K.tolist(), "R": R.tolist(), "T": T.tolist()}
+        pose = {"K": K.tolist(), "R": viewmats[cam, :3, :3].tolist(), "T": viewmats[cam, :3, 3].tolist()}
         cameras.append({"name": name, "size": list(proposal.size), **pose})
     content = {"fps": proposal.fps, "near": proposal.near_far[0], "far": proposal.near_far[1], "cameras": cameras}
     (unfinished / FILE).write_text(json.dumps(content, indent=1))
-    shutil.rmtree(folder, ignore_errors=True)
     os.replace(unfinished, folder)
-    return folder
 
 
 def _cropped(image: np.ndarray, crop: tuple[int, int, int, int]) -> np.ndarray:

@@ -8,6 +8,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +21,12 @@ from gsim3d.capture.calibrate import calibrate
 from gsim3d.capture.films import BOARD, films_in
 from gsim3d.data import Scene, find_scenes, split_scenes
 from gsim3d.data.check import check_scene
+from gsim3d.data.layouts import layout_of
 from gsim3d.data.recording import read_json
 from gsim3d.data.videos import FILE
 from gsim3d.errors import InputError
 from gsim3d.evaluate.protocol import score_scene
-from gsim3d.io.files import write_whole
+from gsim3d.io.files import sha256_of, write_whole
 from gsim3d.io.locks import only_one_writer
 from gsim3d.io.settings import from_dict, to_dict
 from gsim3d.nn.multiview_encoder.config import ViTConfig
@@ -41,6 +43,7 @@ BATCH = {"cpu": 1, "cuda": 4}
 PROBED = 3  # optimizer steps of each phase that are timed
 SCORED_STEPS = 12  # predicted steps of a scored window
 MOST_WINDOWS = 24
+RECORD = "capture.json"  # file of what the run folder belongs to
 # Files of the steps' results in the run folder, without their ending .json.
 FILES = {"check": "check", "propose": "proposal", "settings": "settings", "train": "train", "score": "metrics"}
 
@@ -75,7 +78,7 @@ def capture(
 
     Raises:
         InputError: films or cameras cannot be used; the message names angles or reprojection errors. Or ``out`` was
-            started with other films or settings.
+            started with other films, cameras or settings.
     """
     folder, out = Path(folder), Path(out)
     if not folder.is_dir():
@@ -94,6 +97,7 @@ def capture(
         run.check_same()
         run.calibrate(board, scale)
         run.step("check", run.check)
+        write_whole(out / RECORD, json.dumps(run.given(), indent=1) + "\n")
         proposal = run.step("propose", run.propose)
         settings = run.step("settings", lambda: run.settings(proposal))
         trained = run.step("train", lambda: run.train(settings))
@@ -112,17 +116,26 @@ class _Run:
     force: bool
     say: Callable[[str], None]
 
+    def given(self) -> dict[str, Any]:
+        """Returns what the run folder belongs to, by name: settings, pretrained depth, cameras and films."""
+        depth = [self.depth[0], Path(self.depth[1]).name] if self.depth else None
+        where = os.path.relpath(self.folder.resolve(), self.out.resolve())
+        found = {"DIR": where, "device": self.device, "minutes": self.minutes, "depth": depth}
+        found |= {depth[1]: f"sha256 {sha256_of(Path(self.depth[1]))}"} if depth else {}
+        for take in self.takes():
+            file = take / layout_of(take).FILE
+            states = {file: f"sha256 {sha256_of(file)}"} if file.is_file() else {}
+            states |= {film: f"{film.stat().st_size} bytes of {int(film.stat().st_mtime)}" for film in films_in(take)}
+            found |= {file.relative_to(self.folder).as_posix(): state for file, state in states.items()}
+        return found
+
     def check_same(self) -> None:
         """Raises InputError if the run folder belongs to other films or settings; both may have moved together."""
-        depth = [self.depth[0], Path(self.depth[1]).name] if self.depth else None
-        films = os.path.relpath(self.folder.resolve(), self.out.resolve())
-        given = {"DIR": films, "device": self.device, "minutes": self.minutes, "depth": depth}
-        file = self.out / "capture.json"
-        before = read_json(file) if file.is_file() else given
-        if changed := [key for key in given if before.get(key) != given[key]]:
-            was = ", ".join(f"{key} {before.get(key)}" for key in changed)
-            raise InputError(f"{self.out}: was started with {was}; give the same, or another --out")
-        write_whole(file, json.dumps(given, indent=1) + "\n")
+        if (self.out / RECORD).is_file() and (self.out / "check.json").is_file():
+            before, given = read_json(self.out / RECORD), self.given()
+            if changed := [name for name in (*given, *before) if before.get(name) != given.get(name)]:
+                was = f"{self.out}: was started with {changed[0]} {before.get(changed[0])}; give the same"
+                raise InputError(f"{was}, or another --out, or delete {self.out / 'check.json'} to begin anew")
 
     def step(self, name: str, compute: Callable[[], Any]) -> Any:
         """Returns the result of a step, read from its file if it exists, else computed and written."""
@@ -137,52 +150,70 @@ class _Run:
         write_whole(file, json.dumps(result, indent=1) + "\n")
         return read_json(file)
 
+    def takes(self) -> list[Path]:
+        """Returns the scenes in the folder; films without cameras are none."""
+        with suppress(InputError):
+            return find_scenes(self.folder)
+        return []
+
     def scenes(self, part: str) -> list[Path]:
         return find_scenes(self.out / "scenes" / part)
 
     def calibrate(self, board: Board | None, scale) -> None:
-        """Writes cameras.json where films have none."""
-        below = [path for path in self.folder.iterdir() if path.is_dir() and path.name != BOARD]
-        filmed = [take for take in (self.folder, *below) if films_in(take)]
-        if filmed and not all((take / FILE).is_file() for take in filmed):
-            calibrate(self.folder, board=board, scale=scale, force=self.force, say=self.say)
+        """Writes cameras.json of films that have none; given ones are kept."""
+        scenes, below = self.takes(), [path for path in sorted(self.folder.iterdir()) if path.name != BOARD]
+        takes = [self.folder] if self.folder in scenes or films_in(self.folder) else below
+        filmed = [take for take in takes if take not in scenes and take.name[0] != "." and films_in(take)]
+        if not filmed and not scenes:
+            raise InputError(f"{self.folder} contains no scene (see docs/reference/data.md), and no films <camera>.mp4")
+        if not filmed:
+            unused = "; --board and --scale have no effect: delete cameras.json to repeat it" if board or scale else ""
+            self.say(f"calibrate: done, or cameras given ({', '.join(path.name for path in scenes)}){unused}")
             return
+        started = self.out / "calibrating"  # exists while cameras.json of several takes are written
+        if scenes and takes is below and not started.is_file():
+            both = f"{filmed[0]}: has films but no {FILE}, unlike {scenes[0]}"
+            raise InputError(f"{both}: give its cameras, or calibrate all takes (gsim3d calibrate {self.folder})")
+        started.touch()
         try:
-            names = [path.name for path in find_scenes(self.folder)]
-        except InputError as error:
-            raise InputError(f"{error}; and no films <camera>.mp4") from None
-        unused = "; --board and --scale have no effect: delete cameras.json to repeat it" if board or scale else ""
-        self.say(f"calibrate: done, or cameras given ({', '.join(names)}){unused}")
+            calibrate(self.folder, board=board, scale=scale, force=self.force, say=self.say)
+        except InputError:
+            started.unlink()
+            raise
+        started.unlink()
 
     def check(self) -> dict:
         """Refuses what cannot be learned from, unless forced."""
-        problems, angles, errors = [], None, {}
+        problems: dict[str, Path] = {}  # and the first take that has each
+        found, rig = {}, ""
         for path in find_scenes(self.folder):
-            found = check_scene(path)
-            problems += found.problems
-            if found.scene is None:
-                raise InputError(found.problems[0])
-            extra = [film.name for film in films_in(path) if film.stem not in found.scene.camera_names]
-            problems += [f"{path / FILE}: has no camera of {', '.join(extra)}: calibrate again"] if extra else []
-            if found.scene.cameras_move:
+            checked = check_scene(path)
+            scene, own = checked.scene, list(checked.problems)
+            if scene is None:
+                raise InputError(own[0])
+            if scene.cameras_move:
                 raise InputError(f"{path}: a capture needs cameras that do not move")
-            if angles is None:
-                angles = check.angles(found.scene.recording.viewmats[0])
-                errors = {} if found.problems else check.match_errors(found.scene, angles)
-                problems += [check.overlap_problem(found.scene.camera_names, angles)]
-                problems += [check.fit_problem(errors, found.scene.width)]
-        problems = [problem for problem in problems if problem]
-        nearest = np.where(np.eye(len(angles), dtype=bool), np.inf, angles).min(1)
-        self.say(f"  angles to the nearest camera: {', '.join(f'{angle:.0f}' for angle in nearest)} degrees")
-        worst = max((error for error, _ in errors.values()), default=None)
-        fit = "too few to judge" if worst is None else f"at most {worst:.2f} px ({len(errors)} pairs of cameras)"
-        self.say(f"  reprojection error of matched features: {fit}")
+            cameras = f"{', '.join(scene.camera_names)} of {list(scene.recorded_sizes)} pixels"
+            if cameras != (rig := rig or cameras):
+                raise InputError(f"{path}: has cameras {cameras}, other takes {rig}; give it a folder of its own")
+            extra = [film.name for film in films_in(path) if film.stem not in scene.camera_names]
+            own += [f"{path / FILE}: has no camera of {', '.join(extra)}: calibrate again"] if extra else []
+            angles = check.angles(scene.recording.viewmats[0])
+            errors = {} if own else check.match_errors(scene, angles)
+            centres = None if own else check.centre_error(prepare.open_take(path, self.out / "cache"))
+            own += [check.overlap_problem(scene.camera_names, angles), check.fit_problem(errors, scene.width)]
+            own += [check.NO_CENTRE.format(*centres)] if centres and centres[0] > centres[1] else []
+            problems |= {problem: path for problem in own if problem and problem not in problems}
+            found[str(path)] = {"angles": angles.tolist(), "errors": errors, "centres": centres}
+            self.say(f"  {path}: {check.summary(angles, errors, centres)}")
+            if scene.has_actions():
+                self.say("  its points of actors are not used; gsim3d train does (configs/train/hocap.yaml)")
         if problems and not self.force:
-            more = f" (and {len(problems) - 1} more problems)" if len(problems) > 1 else ""
-            raise InputError(f"{self.folder}: {problems[0]}{more}; --force goes on")
-        for problem in problems:
-            self.say(f"  ignored, because of --force: {problem}")
-        return {"angles": angles.tolist(), "errors": errors, "ignored": problems}
+            (problem, path), more = next(iter(problems.items())), len(problems) - 1
+            raise InputError(f"{path}: {problem}{f' (and {more} more problems)' if more else ''}; --force goes on")
+        for problem, path in problems.items():
+            self.say(f"  ignored, because of --force: {problem} ({path})")
+        return {"takes": found, "ignored": list(problems)}
 
     def propose(self) -> dict:
         """Writes the prepared scenes, and returns the proposal."""
@@ -202,8 +233,8 @@ class _Run:
             if len(steps) < least:
                 raise InputError(f"{take.path}: has {len(steps)} usable frames at {take.fps:g} a second, needs {least}")
         scenes = self.out / "scenes"
+        shutil.rmtree(scenes, ignore_errors=True)
         for part, chosen in (("train", train), ("test", test)):
-            (scenes / part).mkdir(parents=True, exist_ok=True)
             for take, steps in chosen:
                 below = take.path.resolve().relative_to(self.folder.resolve()).parts or (self.folder.resolve().name,)
                 prepare.write_scene(take, proposal, steps, scenes / part / "_".join(below))
@@ -220,7 +251,6 @@ class _Run:
         history, device = prepare.HISTORY[self.device], self.device
         shortest = min(Scene.open(folder).n_steps for folder in folders)
         held_out = proposal["held_out_camera"]
-        n_inputs = len(proposal["crops"]) - (held_out is not None)
         horizons = sorted({min(horizon, shortest - history) for horizon, _, _ in PHASES})
         phase = {"steps": PROBED, "batch": BATCH[device], "warm_up": 0.1}
         phase["encoder_rate"] = DEPTH_RATE if self.depth else 1.0
@@ -236,7 +266,7 @@ class _Run:
             phases=tuple(phases),
             data=DataConfig(
                 history=history,
-                context_views=min(n_inputs, 4),
+                context_views=min(len(proposal["crops"]) - (held_out is not None), 4),
                 target_only_cameras=() if held_out is None else (held_out,),
                 body_stride=proposal["body_stride"],
                 background_stride=proposal["body_stride"],
@@ -250,7 +280,7 @@ class _Run:
     def _timed(self, config: TrainConfig, folders: list[Path]) -> TrainConfig:
         """Returns the configuration with as many steps as fit into the time to train."""
         scenes = [Scene.open(folder) for folder in folders]
-        phases = []
+        phases, slowest = [], 0.0
         with tempfile.TemporaryDirectory() as temporary:
             trainer = Trainer(config, scenes, temporary, device=self.device)
             trainer.simulator.train()
@@ -264,16 +294,16 @@ class _Run:
                 steps = max(1, int(60 * self.minutes * share / min(seconds)))
                 self.say(f"  phase with {phase.horizon} simulated steps: {steps} steps of {min(seconds):.2f} s")
                 phases.append(dataclasses.replace(phase, steps=steps))
-        return dataclasses.replace(config, phases=tuple(phases))
+                slowest = max(slowest, min(seconds))
+        return dataclasses.replace(config, phases=tuple(phases), checkpoint_every=max(1, int(60 / slowest)))
 
     def train(self, settings: dict) -> dict:
         """Trains the model, or continues; returns on what, how long and how many steps."""
         config = from_dict(TrainConfig, settings)
         train(config, self.scenes("train"), self.out / "model", device=self.device)
-        last = (self.out / "model" / LOG).read_text().splitlines()[-1]
-        minutes = round(json.loads(last)["machine"]["seconds"] / 60, 2)
+        seconds = json.loads((self.out / "model" / LOG).read_text().splitlines()[-1])["machine"]["seconds"]
         machine = torch.cuda.get_device_name() if self.device == "cuda" else self.device
-        return {"device": machine, "minutes": minutes, "steps": config.n_steps}
+        return {"device": machine, "minutes": round(seconds / 60, 2), "steps": config.n_steps}
 
     def score(self, trained: dict) -> dict:
         """Scores windows of the held-out steps against the constant baseline."""

@@ -3,14 +3,14 @@
 Steps, each of which prints what it decides and why, writes its result, and is skipped when it is done:
 
   calibrate   cameras.json beside the films (gsim3d calibrate), unless there are cameras
-  check       every file, angles between cameras, reprojection error of matched features     OUT/check.json
+  check       files and angles; errors of matched features and of moving bodies              OUT/check.json
   propose     frame rate, crop, size, stride, depth range; prepared scenes in OUT/scenes     OUT/proposal.json
   settings    of the training: steps that fit into --minutes                                 OUT/settings.json
   train       the model in OUT/model; an interrupted training continues                      OUT/train.json
   score       held-out steps against the constant baseline                                   OUT/metrics.json
 
 Refused unless --force: cameras further than 45 degrees from their nearest neighbour, and calibrations that do not fit.
-Delete a file in OUT to repeat its step and those below.
+Delete a file in OUT to repeat its step and those below; other films or cameras need OUT/check.json deleted.
 
 examples:
   gsim3d capture films --board 7 5 0.04 --out runs/capture --device cuda

@@ -1,7 +1,9 @@
 """The command capture: refusals with reasons, decisions, prepared scenes, skipped steps."""
 
 import json
+import os
 import shutil
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -17,6 +19,7 @@ from gsim3d.data.masks import background_image, foreground
 from gsim3d.errors import InputError
 from gsim3d.nn.multiview_encoder import Encoder, EncoderConfig
 from gsim3d.nn.multiview_encoder.config import ViTConfig
+from gsim3d.train.config import TrainConfig
 from gsim3d.train.restore import restore
 from tests.capture.made_films import rig, write_textured_films
 from tests.capture.made_takes import cameras_at, write_take
@@ -66,6 +69,105 @@ def test_a_step_whose_file_is_deleted_is_repeated_with_those_below(tmp_path):
     with pytest.raises(InputError, match="scenes"):
         steps.settings({})
     assert not (tmp_path / "model").exists()  # a new training does not continue the old one
+
+
+def bare_run(folder, out, say=lambda _: None, depth=None, force=False):
+    out.mkdir(exist_ok=True)
+    return _Run(folder, out, "cpu", 1.0, depth, force, say)
+
+
+def edit_cameras(folder, change):
+    content = json.loads((folder / "cameras.json").read_text())
+    change(content["cameras"])
+    (folder / "cameras.json").write_text(json.dumps(content))
+
+
+def test_a_run_belongs_to_its_films_cameras_and_depth(tmp_path):
+    take, depth = write_take(tmp_path / "films" / "a", n_frames=4), tmp_path / "model.safetensors"
+    depth.write_bytes(b"one")
+    run = bare_run(tmp_path / "films", tmp_path / "run", depth=("tiny", str(depth)))
+    (run.out / "check.json").write_text("{}")
+    (run.out / "capture.json").write_text(json.dumps(run.given()))
+    run.check_same()
+    film, cameras = take / "left.avi", take / "cameras.json"
+    for file, change in (
+        (depth, lambda: depth.write_bytes(b"two")),
+        (film, lambda: film.write_bytes(film.read_bytes() + b"0")),
+        (cameras, lambda: edit_cameras(take, lambda entries: entries[0].update(offset=0.5))),
+        (cameras, cameras.unlink),
+    ):
+        kept, times = file.read_bytes(), (file.stat().st_atime, file.stat().st_mtime)
+        change()
+        with pytest.raises(InputError, match=rf"started with \S*{file.name} .*delete .*check.json to begin anew"):
+            run.check_same()
+        file.write_bytes(kept)
+        os.utime(file, times)
+        run.check_same()
+    cameras.unlink()
+    (run.out / "check.json").unlink()
+    run.check_same()
+
+
+def test_given_cameras_are_kept(tmp_path, monkeypatch):
+    calls = []
+    monkeypatch.setattr("gsim3d.capture.run.calibrate", lambda folder, **_: calls.append(folder))
+    film = write_take(tmp_path / "a", n_frames=4) / "left.avi"
+    for inner in ("original", "masks"):
+        (tmp_path / "a" / inner).mkdir()
+        shutil.copy(film, tmp_path / "a" / inner)
+    bare_run(tmp_path / "a", tmp_path / "run").calibrate(None, None)
+    mixed = bare_run(tmp_path, tmp_path / "run")
+    mixed.calibrate(None, None)
+    write_take(tmp_path / "b", n_frames=4).joinpath("cameras.json").unlink()
+    with pytest.raises(InputError, match=r"b: has films but no cameras.json, unlike \S*a: give its cameras"):
+        mixed.calibrate(None, None)
+    assert not calls
+    (tmp_path / "run" / "calibrating").touch()  # an interrupted call wrote those of a
+    mixed.calibrate(None, None)
+    assert calls == [tmp_path] and not (tmp_path / "run" / "calibrating").exists()
+
+
+def test_every_take_is_checked(tmp_path, monkeypatch):
+    write_take(tmp_path / "films" / "a", n_frames=16)
+    write_take(tmp_path / "films" / "b", (0, 60, 180), n_frames=16)
+    run = bare_run(tmp_path / "films", tmp_path / "run")
+    with pytest.raises(InputError, match="films/b: the views do not overlap"):
+        run.check()
+    edit_cameras(tmp_path / "films" / "b", lambda entries: entries.reverse())
+    with pytest.raises(InputError, match=r"films/b: has cameras right, middle, left .* other takes left, middle"):
+        run.check()
+    shutil.rmtree(tmp_path / "films" / "b")
+    monkeypatch.setattr("tests.capture.made_takes.SIZE", 80)
+    write_take(tmp_path / "films" / "b", n_frames=16)
+    with pytest.raises(InputError, match=r"films/b: has cameras .*\(80, 80\).* pixels, other takes .*\(96, 96\)"):
+        run.check()
+
+
+def test_depths_are_those_of_the_cameras_of_each_take(tmp_path):
+    for name in ("a", "b"):
+        write_take(tmp_path / name, n_frames=24)
+    edit_cameras(tmp_path / "b", lambda entries: [own.update(T=[3 * x for x in own["T"]]) for own in entries])
+    takes = [prepare.open_take(tmp_path / name, tmp_path / "cache") for name in ("a", "b")]
+    assert prepare._depths(takes)[1] > 2 * prepare._depths(takes[:1])[1]
+
+
+def test_a_repeated_proposal_leaves_no_old_scenes(tmp_path):
+    for name in ("b", "c"):
+        write_take(tmp_path / "films" / name, n_frames=16)
+    run = bare_run(tmp_path / "films", tmp_path / "run")
+    run.propose()
+    write_take(tmp_path / "films" / "a", n_frames=16)
+    run.propose()
+    train, test = ([path.name for path in run.scenes(part)] for part in ("train", "test"))
+    assert train == ["b", "c"] and test == ["a"]
+
+
+def test_training_is_saved_every_minute(tmp_path, monkeypatch):
+    clock = iter(range(1000))
+    monkeypatch.setattr("gsim3d.capture.run.time.perf_counter", lambda: next(clock) / 2)
+    trainer = SimpleNamespace(train_step=lambda: None, simulator=SimpleNamespace(train=lambda: None))
+    monkeypatch.setattr("gsim3d.capture.run.Trainer", lambda *_, **__: trainer)
+    assert bare_run(tmp_path, tmp_path / "run")._timed(TrainConfig(), []).checkpoint_every == 120
 
 
 def test_pretrained_depth_is_trained_on(run, tmp_path, monkeypatch, capsys):
@@ -151,6 +253,8 @@ def test_views_far_apart_are_refused_with_their_angles(tmp_path, capsys):
     angles = check.angles(np.stack(cameras_at((0, 55, 180))))
     assert f"left-middle {angles[0, 1]:.0f}, left-right {angles[0, 2]:.0f}" in message
     assert "--force" in message and not (tmp_path / "run" / "check.json").exists()
+    assert main([*arguments, "--minutes", "3"]) == 2  # nothing was started yet
+    assert "do not overlap" in capsys.readouterr().err
 
 
 def test_a_wrong_camera_is_refused_by_the_error_of_matches(tmp_path):
@@ -172,6 +276,31 @@ def test_a_wrong_camera_is_refused_by_the_error_of_matches(tmp_path):
     turn = cv2.Rodrigues(np.array([0.04, 0.0, 0.0]))[0]
     entries[1] |= {key: (turn @ np.array(entries[1][key])).tolist() for key in ("R", "T")}
     assert "does not fit" in problem() and "cam0-cam1" in problem() and "px" in problem()
+
+
+@pytest.mark.parametrize("degrees, offset", [(0, 0.0), (3, 0.0), (0, 0.4)])
+def test_a_wrong_camera_or_time_is_refused_by_moving_bodies(tmp_path, degrees, offset):
+    def change(entries):
+        turn = cv2.Rodrigues(np.radians([0.0, degrees, 0.0]))[0]
+        entries[1] |= {key: (turn @ np.array(entries[1][key])).tolist() for key in ("R", "T")}
+        entries[1]["offset"] += offset
+
+    edit_cameras(write_take(tmp_path / "ball"), change)
+    run = bare_run(tmp_path / "ball", tmp_path / "run")
+    if degrees or offset:
+        with pytest.raises(InputError, match=r"rays through the centres of the moving bodies miss .* px \(at most"):
+            run.check()
+    else:
+        assert not run.check()["ignored"]
+
+
+def test_what_cannot_be_judged_or_used_is_said(tmp_path):
+    said = []
+    bare_run(write_take(tmp_path / "ball", n_frames=8, masks="none"), tmp_path / "run", said.append).check()
+    assert "nothing shows whether the calibration fits" in said[0]
+    write_hocap(tmp_path / "hocap", n_frames=8)
+    bare_run(tmp_path / "hocap", tmp_path / "run", said.append).check()
+    assert "points of actors are not used" in said[-1]
 
 
 def test_a_floor_of_equal_tiles_does_not_refuse_a_calibration(tmp_path):
