@@ -54,7 +54,8 @@ def read(folder: Path, problems: Problems) -> Recording:
     fps, resample = description.positive("fps"), description.positive("resample")
     given = {n: array(e.values.get("offset", 0), [()], f"{e.where}offset", problems) for n, e in entries.items()}
     offsets = {name: 0.0 if offset is None else float(offset) for name, offset in given.items()}
-    numbers, rate, notes = _steps(sources, offsets, fps, resample, source, problems)
+    aligned = any("offset" in entry.values for entry in entries.values())
+    numbers, rate, notes = _steps(sources, offsets, aligned, fps, resample, source, problems)
     unit, center = _unit(description), description.values.get("pixel_center", 0.5)
     if center not in (0, 0.5):
         raise InputError(f"{description.where}pixel_center must be 0 (OpenCV's calibration) or 0.5; got {center!r}")
@@ -203,12 +204,14 @@ def _frames_of(folder: Path, name: str, size: tuple[int, int], source: Path, pro
 def _steps(
     sources: dict[str, _Frames | Video],
     offsets: dict[str, float],
+    aligned: bool,
     fps: float | None,
     resample: float | None,
     source: Path,
     problems: Problems,
 ) -> tuple[list[list[int]], float, list[str]]:
-    """Synchronises the cameras: returns frame numbers of each camera by step, steps per second, and notes."""
+    """Synchronises the cameras: returns frame numbers of each camera by step, steps per second, and notes. ``aligned``
+    ones may have other frames before or behind those of all cameras."""
     videos = {name: frames for name, frames in sources.items() if isinstance(frames, Video) and frames.numbers}
     folders = {name: frames for name, frames in sources.items() if isinstance(frames, _Frames) and frames.numbers}
     if folders and fps is None:
@@ -251,13 +254,14 @@ def _steps(
     if off > OFF_STEP:
         notes.append(f"frames are up to {1000 * off / rate:.3g} ms off their steps")
     ticks = {name: [first[name] + number for number in sources[name].numbers] for name in sources if name in first}
-    if any(first.values()):
+    if aligned or any(first.values()):
         low, high = max(own[0] for own in ticks.values()), min(own[-1] for own in ticks.values())
         longest = max(map(len, ticks.values()))
         ticks = {name: [tick for tick in own if low <= tick <= high] for name, own in ticks.items()}
         if high - low + 1 < longest:
             common = max(0, high - low + 1)
-            notes.append(f"the videos start at different times: {common} of {longest} frames are common")
+            differ = "start" if any(first.values()) else "end"
+            notes.append(f"the videos {differ} at different times: {common} of {longest} frames are common")
     common = recording.common_numbers(ticks, source, problems) if ticks else []
     if not common:
         raise InputError(f"{source}: the cameras have no frame number in common")

@@ -222,6 +222,12 @@ def test_broken_videos_are_named(videos, tmp_path):
     write_video(file, list(made.rgb[:7, 1]), FPS)
     with pytest.raises(InputError, match="camera video_1 has 7 frames, camera video_0 9; missing: frame 7, 8"):
         Scene.open(broken)
+    content = json.loads((broken / "cameras.json").read_text())
+    aligned = {**content, "cameras": [{**camera, "offset": 0.0} for camera in content["cameras"]]}
+    (broken / "cameras.json").write_text(json.dumps(aligned))  # as gsim3d calibrate writes them
+    scene = Scene.open(broken)
+    assert scene.n_steps == 7 and "end at different times: 7 of 9 frames are common" in scene.recording.notes[-1]
+    (broken / "cameras.json").write_text(json.dumps(content))
     write_video(file, [image[:32] for image in made.rgb[:, 1]], FPS)
     with pytest.raises(InputError, match=r"video_1.mp4 \(camera video_1\) has 96x32 pixels, its camera 96x64"):
         Scene.open(broken)
