@@ -71,10 +71,8 @@ class Agreement:
     """Agreement of a setting with the reference run."""
 
     psnr: float  #: mean PSNR of the images in dB
-    psnr_worst: float  #: lowest PSNR of an image in dB
-    #: mean distance of moving particles over all steps, in cells; None if the particle sets differ
-    position_mean: float | None
-    position_max: float | None  #: largest such distance
+    #: largest distance of moving particles over all steps, in cells; None if the particle sets differ
+    position_max: float | None
 
 
 @dataclass(eq=False)
@@ -274,10 +272,10 @@ class BenchmarkCase:
         except (torch.OutOfMemoryError, NumericalError, InputError) as error:
             point.failure = reason(error)
             return
-        images, mean, largest = torch.cat(differences), None, None
+        images, largest = torch.cat(differences), None
         if all(distance is not None for distance in distances) and len(positions := torch.cat(distances)):
-            mean, largest = float(positions.mean()), float(positions.max())
-        point.agreement = Agreement(float(images.mean()), float(images.min()), mean, largest)
+            largest = float(positions.max())
+        point.agreement = Agreement(float(images.mean()), largest)
         point.task, point.by_step = _means(scores)
         point.resting_share = statistics.fmean(resting)
 

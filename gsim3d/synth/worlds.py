@@ -144,10 +144,8 @@ class Rigid(FallingWorld):
     engines = ("mujoco",)
 
     def _make_body(self, name, vertices, faces, velocity, spin, rng):
-        if self.by_name:
-            friction, bounce = bodies.named_contact(name, self.friction, self.bounce)
-        else:
-            friction, bounce = rng.uniform(*self.friction), rng.uniform(*self.bounce)
+        ranges = self.friction, self.bounce
+        friction, bounce = bodies.named_contact(name, *ranges) if self.by_name else (rng.uniform(*x) for x in ranges)
         mass = RIGID_DENSITY * float(np.prod(np.ptp(vertices, axis=0)))
         parts = tuple(meshes.convex_pieces(vertices, faces))
         facts = {"friction": round(friction, 6), "bounce": round(bounce, 6)}

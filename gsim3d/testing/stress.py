@@ -113,6 +113,10 @@ def _runs_finite(what: str, simulator: Simulator, frames: Frames, sample: Sample
     """Checks that encoded particles, their rollout and its image are finite."""
     state = simulator.encode(frames)
     yield from _finite(f"{what}: encoded", state)
+    yield from _rolls_finite(what, simulator, state, sample)
+
+
+def _rolls_finite(what: str, simulator: Simulator, state: Particles, sample: Sample) -> Iterator[Deviation]:
     steps = simulator.rollout(state, sample.n_steps, sample.plan, report=StabilityReport())
     yield from _finite(f"{what}: rollout's", steps[-1])
     yield _finite_image(f"{what}:", simulator, steps[-1], sample.targets)
@@ -207,9 +211,7 @@ def crowds(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
         ),
     }
     for name, crowd in crowds.items():
-        steps = simulator.rollout(crowd, sample.n_steps, sample.plan, report=StabilityReport())
-        yield from _finite(f"{name}: rollout's", steps[-1])
-        yield _finite_image(f"{name}:", simulator, steps[-1], sample.targets)
+        yield from _rolls_finite(name, simulator, crowd, sample)
 
 
 @torch.no_grad()

@@ -26,7 +26,7 @@ MEASURED = PartTimes("here", Workload(100, 300, 2, 1024), dynamics=6.0, gaussian
 
 def at(setting, seconds, psnr, other_round=None):
     timings = Timing((seconds,)), Timing((other_round or seconds,))
-    return Point(setting, "", "model", agreement=Agreement(psnr, psnr, None, None), step=timings)
+    return Point(setting, "", "model", agreement=Agreement(psnr, None), step=timings)
 
 
 def all_points(point):
@@ -42,7 +42,7 @@ def fake(case, monkeypatch):
         for point in points:
             if not point.step:
                 measured.append(point.setting)
-                point.agreement, point.step = Agreement(55.0, 50.0, None, None), (Timing((3.0,)),)
+                point.agreement, point.step = Agreement(55.0, None), (Timing((3.0,)),)
 
     monkeypatch.setattr(sweep, "run", run)
     return sweep, measured
