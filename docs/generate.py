@@ -12,7 +12,7 @@ from statistics import mean, stdev
 
 DOCS = Path(__file__).parent
 ROOT, RESULTS = DOCS.parent, DOCS / "results"
-CAPTURES_HEAD = ("films", "encoder", "machine", "minutes", "steps", "windows")
+CAPTURES_HEAD = ("videos", "encoder", "machine", "minutes", "steps", "windows")
 CAPTURES_HEAD += ("masked PSNR dB", "constant dB", "copy dB", "above constant", "above copy", "above plane sweep")
 CAPTURE_METHODS = "model", "constant", "copy"
 COST_HEAD = ("#", "setting", "kind", "step ms", "p95", "encode ms", "faster", "agreement dB", "masked PSNR dB", "kept")
@@ -199,7 +199,7 @@ def stability() -> str:
 
 
 def captures(folder: Path) -> str:
-    """Scores of the films of generated scenes, of the runs of tools/capture_films.sh."""
+    """Scores of the videos of generated scenes, of the runs of tools/capture_videos.sh."""
     found = {tuple(file.stem.split("-")): json.loads(file.read_text()) for file in sorted(folder.glob("*-*.json"))}
     if not found:
         return "Not measured yet.\n"
@@ -214,11 +214,11 @@ def captures(folder: Path) -> str:
         return f"{mean(differences):+.2f}{error}"
 
     rows = []
-    for (films, encoder), own in windows.items():
-        run, sweep = found.get((films, encoder), {}), windows.get((films, "plane_sweep"))
+    for (clips, encoder), own in windows.items():
+        run, sweep = found.get((clips, encoder), {}), windows.get((clips, "plane_sweep"))
         is_paired = encoder != "plane_sweep" and sweep and sweep["copy"] == own["copy"]  # of the same windows
         rows.append(
-            (films.replace("_", " "), encoder, *(run.get(key, "") for key in ("device", "minutes", "steps")))
+            (clips.replace("_", " "), encoder, *(run.get(key, "") for key in ("device", "minutes", "steps")))
             + (len(own["model"]), *(f"{mean(own[method]):.2f}" for method in CAPTURE_METHODS))
             + tuple(apart(own["model"], own[method]) for method in CAPTURE_METHODS[1:])
             + (apart(own["model"], sweep["model"]) if is_paired else "",)

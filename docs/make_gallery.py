@@ -1,9 +1,9 @@
-"""Makes the films and posters of the gallery: every shipped simulator, every edit and an orbit.
+"""Makes the videos and posters of the gallery: every shipped simulator, every edit and an orbit.
 
-python docs/make_gallery.py                        all; films and scenes in docs/_build/gallery, minutes on 2 cores
+python docs/make_gallery.py                        all; videos and scenes in docs/_build/gallery, minutes on 2 cores
 python docs/make_gallery.py --only throw --out DIR --posters DIR
 
-It needs pip install 'gsim3d[generate]'; with gsim3d[video] films are H.264. A scene that is there already is kept.
+It needs pip install 'gsim3d[generate]'; with gsim3d[video] videos are H.264. A scene that is there already is kept.
 """
 
 import argparse
@@ -42,8 +42,8 @@ from gsim3d.io.sequence import open_sequence  # noqa: E402
 from gsim3d.state import Particles  # noqa: E402
 from gsim3d.synth import generate  # noqa: E402
 from gsim3d.train.restore import Restored, restore  # noqa: E402
+from gsim3d.viewer.clips import ACCENT, GAP, WHITE, clip_frames, write_text, write_time  # noqa: E402
 from gsim3d.viewer.export import write_frames  # noqa: E402
-from gsim3d.viewer.films import ACCENT, GAP, WHITE, film_frames, write_text, write_time  # noqa: E402
 
 Rows = dict[str, np.ndarray]  # label -> images uint8 [S, V, H, W, 3]
 BODY = {"elastic": "star", "cloth": "blob", "rigid": "capsule"}  # world -> what falls
@@ -145,15 +145,15 @@ def of_edits(out: Path, frames: int | None) -> Iterator[tuple[str, Callable[[], 
 
 
 def orbit(out: Path, posters: Path, frames: int | None) -> None:
-    """The film and poster of a camera that circles around a prediction."""
+    """The video and poster of a camera that circles around a prediction."""
     restored = restore(EDITED)
     scene = restored.open_scene(scene_of("elastic", out, frames))
     prediction = drawn(restored, scene, 1, min(EDIT_STEPS, scene.n_steps - restored.data.history))[0]
-    film = out / "orbit.mp4"
+    clip = out / "orbit.mp4"
     write_gaussians(out / "orbit", restored, prediction, scene.fps)
-    film.unlink(missing_ok=True)
+    clip.unlink(missing_ok=True)
     frames = open_sequence(out / "orbit")
-    write_frames(film, frames, len(frames), fps=frames.fps, turns=TURNS)
+    write_frames(clip, frames, len(frames), fps=frames.fps, turns=TURNS)
     images = np.stack(list(orbit_frames(frames, len(frames), TILE, TURNS)))[:, None]
     poster(posters / "orbit.jpg", {"": images}, scene.fps, 0)
 
@@ -161,7 +161,7 @@ def orbit(out: Path, posters: Path, frames: int | None) -> None:
 @torch.no_grad()
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=DOCS / "_build" / "gallery", help="folder of films and scenes")
+    parser.add_argument("--out", type=Path, default=DOCS / "_build" / "gallery", help="folder of videos and scenes")
     parser.add_argument("--posters", type=Path, default=DOCS / "results" / "gallery", help="folder of posters")
     parser.add_argument("--only", nargs="+", metavar="NAME", help="simulators, edits, or orbit")
     parser.add_argument("--frames", type=int, help="steps of the scenes (default: as in training)")
@@ -173,7 +173,7 @@ def main() -> None:
     for name, made in pieces.items():
         if args.only is None or name in args.only:
             rows, fps, n_given = made()
-            write_video(args.out / f"{name}.mp4", film_frames(rows, fps, n_given), fps)
+            write_video(args.out / f"{name}.mp4", clip_frames(rows, fps, n_given), fps)
             poster(args.posters / f"{name}.jpg", rows, fps, n_given)
             print(args.out / f"{name}.mp4", flush=True)
     if args.only is None or "orbit" in args.only:

@@ -586,7 +586,7 @@ class Gaussians(TensorRecord):
             None if colours are not needed.
         cu_rows: int64 [Q + 1], offsets of the clouds.
         world_offset: float64 [Q, 3] metres, ``world_offset`` of each cloud's scene; None: 0.
-        antialiased: of a file that was trained with Mip-Splatting's compensation: pictures, films and players multiply
+        antialiased: of a file that was trained with Mip-Splatting's compensation: pictures, videos and players multiply
             opacities by it.
     """
 

@@ -100,4 +100,4 @@ def test_captures_are_compared_over_the_same_windows(monkeypatch, tmp_path):
     scores = "22.20 | 18.25 | 19.00 | +3.95 ± 0.05 | +3.20 ± 0.20"
     assert f"| elastic | dinov2_small | cpu | 1.5 | 9 | 2 | {scores} | +1.70 ± 0.30 |" in page
     assert "| cloth | plane_sweep | cpu | 1.5 | 9 | 2 | 9.50 | 11.50 | 9.50 | -2.00 ± 1.00 | +0.00 ± 0.00 |  |" in page
-    assert f"| all | dinov2_small |  |  |  | 2 | {scores} |  |" in page  # of other films
+    assert f"| all | dinov2_small |  |  |  | 2 | {scores} |  |" in page  # of other videos

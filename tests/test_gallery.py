@@ -26,11 +26,11 @@ def test_gallery_shows_every_simulator_and_edit():
 @pytest.mark.slow
 def test_gallery_is_made(tmp_path):
     command = [sys.executable, str(ROOT / "docs" / "make_gallery.py"), "--frames", "10", "--only", "throw", "orbit"]
-    command += ["--out", str(tmp_path / "films"), "--posters", str(tmp_path / "posters")]
+    command += ["--out", str(tmp_path / "videos"), "--posters", str(tmp_path / "posters")]
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     for name, size in (("throw", (1028, 512)), ("orbit", (512, 512))):
-        frame = cv2.VideoCapture(str(tmp_path / "films" / f"{name}.mp4")).read()[1]
+        frame = cv2.VideoCapture(str(tmp_path / "videos" / f"{name}.mp4")).read()[1]
         assert frame.shape[:2] == size and frame.std() > 10
         assert cv2.imread(str(tmp_path / "posters" / f"{name}.jpg")).shape[1] == 1036

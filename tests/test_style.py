@@ -13,7 +13,8 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 BANNED = re.compile(
-    r"\b(nobody|somebody|everybody|sittings?|told|daylight|relit|unlit|likewise|(?:the|of|moving|frozen) matter)\b",
+    r"\b(nobody|somebody|everybody|sittings?|(?-i:[Ff]ilms?)|told|daylight|relit|unlit|likewise|"
+    r"(?:the|of|moving|frozen) matter)\b",
     re.IGNORECASE,
 )
 # Old names of settings that a converter, its tests or a stored file must still spell.

@@ -39,8 +39,8 @@ predict() {
   local gsim3d=(env -i PATH= HOME="$work" "$1" -I -m gsim3d)
   cd "$2"
   "${gsim3d[@]}" doctor
-  "${gsim3d[@]}" generate elastic --preset diverse --objects ball --trajectories 1 --frames 8 --processes 1 --out films
-  "${gsim3d[@]}" simulate elastic-small films/ball/0000 --steps 1 --out predicted
+  "${gsim3d[@]}" generate elastic --preset diverse --objects ball --trajectories 1 --frames 8 --processes 1 --out videos
+  "${gsim3d[@]}" simulate elastic-small videos/ball/0000 --steps 1 --out predicted
   [ -s predicted/rollout.mp4 ]
 }
 

@@ -1,4 +1,4 @@
-"""Calibration from films of a ChArUco board: intrinsics of each camera, then all poses by bundle adjustment.
+"""Calibration from videos of a ChArUco board: intrinsics of each camera, then all poses by bundle adjustment.
 
 Pixel centres are OpenCV's (integers). The board's axes are OpenCV's too: x along its rows, y down, z into the paper.
 """
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from gsim3d.capture.films import Film
+from gsim3d.capture.clips import Clip
 from gsim3d.errors import InputError, did_you_mean
 
 MAX_VIEWS = 60  # times at which the board is searched
@@ -78,21 +78,21 @@ class _Views:
     distortion: np.ndarray
 
 
-def calibrate_board(films: Sequence[Film], offsets: Sequence[float], board: Board) -> list[Calibrated]:
+def calibrate_board(clips: Sequence[Clip], offsets: Sequence[float], board: Board) -> list[Calibrated]:
     """Calibrates cameras by a board that is moved before them, or several of them see at rest.
 
     The world is the board where a camera sees it last: x along its rows, z out of the printed side.
 
     Args:
-        films: films of the board.
-        offsets: seconds to add to the times of each film.
+        clips: videos of the board.
+        offsets: seconds to add to the times of each video.
         board: what they show.
 
     Raises:
         InputError: a camera sees the board too rarely, or never at the same time as the others.
     """
-    views = [_intrinsics(film, found) for film, found in zip(films, _detect(films, offsets, board), strict=True)]
-    cameras = _initial_poses([film.name for film in films], views)
+    views = [_intrinsics(clip, found) for clip, found in zip(clips, _detect(clips, offsets, board), strict=True)]
+    cameras = _initial_poses([clip.name for clip in clips], views)
     boards = {}
     for frame in set().union(*(v.found for v in views)):
         cam = max((c for c, v in enumerate(views) if frame in v.found), key=lambda c: len(views[c].found[frame][0]))
@@ -104,32 +104,32 @@ def calibrate_board(films: Sequence[Film], offsets: Sequence[float], board: Boar
     world = boards[max(boards)]
     errors = [float(np.sqrt(np.square(np.concatenate(own)).sum(-1).mean())) for own in residuals]
     return [
-        Calibrated(film.name, film.size, v.K, v.distortion, camera @ world @ OUT_OF_PAPER, error, len(v.found))
-        for film, v, camera, error in zip(films, views, cameras, errors, strict=True)
+        Calibrated(clip.name, clip.size, v.K, v.distortion, camera @ world @ OUT_OF_PAPER, error, len(v.found))
+        for clip, v, camera, error in zip(clips, views, cameras, errors, strict=True)
     ]
 
 
-def calm_times(times: np.ndarray, films: Sequence[Film], offsets: Sequence[float]) -> np.ndarray:
+def calm_times(times: np.ndarray, clips: Sequence[Clip], offsets: Sequence[float]) -> np.ndarray:
     """Returns at most MAX_VIEWS of ``times``: in each part that of least motion, since shutters are not synchronous."""
-    own = [film.video.times + offset for film, offset in zip(films, offsets, strict=True)]
-    speed = sum(np.interp(times, (at[1:] + at[:-1]) / 2, film.motion) for at, film in zip(own, films, strict=True))
+    own = [clip.video.times + offset for clip, offset in zip(clips, offsets, strict=True)]
+    speed = sum(np.interp(times, (at[1:] + at[:-1]) / 2, clip.motion) for at, clip in zip(own, clips, strict=True))
     parts = np.array_split(np.arange(len(times)), min(len(times), MAX_VIEWS))
     return times[[part[speed[part].argmin()] for part in parts]]
 
 
-def _detect(films: Sequence[Film], offsets: Sequence[float], board: Board) -> list[dict[int, tuple]]:
+def _detect(clips: Sequence[Clip], offsets: Sequence[float], board: Board) -> list[dict[int, tuple]]:
     """Returns (object points, pixels) of the board by time, for each camera."""
     detector = cv2.aruco.CharucoDetector(board.made())
-    spans = [film.video.times[[0, -1]] + offset for film, offset in zip(films, offsets, strict=True)]
+    spans = [clip.video.times[[0, -1]] + offset for clip, offset in zip(clips, offsets, strict=True)]
     low, high = max(span[0] for span in spans), min(span[1] for span in spans)
     if low >= high:
-        raise InputError(f"{films[0].video.what}: the films of the board have no time in common")
-    times, every = films[0].video.times + offsets[0], []
-    times = calm_times(times[(times >= low - 1e-6) & (times <= high + 1e-6)], films, offsets)
-    for film, offset in zip(films, offsets, strict=True):
-        own, found = film.video.times + offset, {}
+        raise InputError(f"{clips[0].video.what}: the videos of the board have no time in common")
+    times, every = clips[0].video.times + offsets[0], []
+    times = calm_times(times[(times >= low - 1e-6) & (times <= high + 1e-6)], clips, offsets)
+    for clip, offset in zip(clips, offsets, strict=True):
+        own, found = clip.video.times + offset, {}
         numbers = np.searchsorted((own[1:] + own[:-1]) / 2, times).tolist()
-        for frame, image in enumerate(film.grey(numbers)):
+        for frame, image in enumerate(clip.grey(numbers)):
             corners, ids, *_ = detector.detectBoard(image)
             if ids is not None and len(ids) >= MIN_CORNERS:
                 found[frame] = detector.getBoard().matchImagePoints(corners, ids)
@@ -137,15 +137,15 @@ def _detect(films: Sequence[Film], offsets: Sequence[float], board: Board) -> li
     return every
 
 
-def _intrinsics(film: Film, found: dict[int, tuple]) -> _Views:
+def _intrinsics(clip: Clip, found: dict[int, tuple]) -> _Views:
     if len(found) < MIN_VIEWS:
         raise InputError(
-            f"camera {film.name}: the board is recognised in {len(found)} images; at least {MIN_VIEWS} are needed, "
+            f"camera {clip.name}: the board is recognised in {len(found)} images; at least {MIN_VIEWS} are needed, "
             "close up, tilted and in the corners (are --board and --dictionary those of the print?)"
         )
     points, pixels = zip(*found.values(), strict=True)
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
-    _, K, distortion, turns, shifts = cv2.calibrateCamera(points, pixels, film.size, None, None, flags=flags)
+    _, K, distortion, turns, shifts = cv2.calibrateCamera(points, pixels, clip.size, None, None, flags=flags)
     poses = (_matrix(turn, shift) for turn, shift in zip(turns, shifts, strict=True))
     views = {frame: (*given, pose) for (frame, given), pose in zip(found.items(), poses, strict=True)}
     return _Views(views, K, distortion.reshape(-1)[:5])
@@ -196,7 +196,7 @@ def _adjust(views, cameras, boards):
 
 
 def _drop_outliers(view: _Views, residuals: Sequence[np.ndarray]) -> bool:
-    """Removes the few detections whose error is far above the others': frames that a film repeats. Returns if any."""
+    """Removes the few detections whose error is far above the others': frames that a video repeats. Returns if any."""
     errors = np.array([np.linalg.norm(own, axis=1).mean() for own in residuals])
     outlier = errors > OUTLIER * np.median(errors)
     few = 0 < outlier.sum() <= MOST_OUTLIERS * len(errors)

@@ -97,7 +97,7 @@ def _boxes(takes: Sequence[Scene]) -> tuple[list[tuple], float]:
         y, x = (np.flatnonzero(moving.any((0, axis))) for axis in (2, 1))
         if not len(x):
             raise InputError(
-                f"{takes[0].path}: nothing moves in the masks of camera {takes[0].camera_names[cam]}; film a moving "
+                f"{takes[0].path}: nothing moves in the masks of camera {takes[0].camera_names[cam]}; record a moving "
                 'body, give masks, or set "masks": "none" in cameras.json'
             )
         counts.append(moving.sum((1, 2)).mean())

@@ -1,4 +1,4 @@
-"""Implementation of ``gsim3d capture``: from films to a trained simulator, in steps that each write their result."""
+"""Implementation of ``gsim3d capture``: from videos to a trained simulator, in steps that each write their result."""
 
 import dataclasses
 import json
@@ -18,7 +18,7 @@ import torch
 from gsim3d.capture import check, prepare
 from gsim3d.capture.board import Board
 from gsim3d.capture.calibrate import calibrate
-from gsim3d.capture.films import BOARD, films_in
+from gsim3d.capture.clips import BOARD, clips_in
 from gsim3d.data import Scene, find_scenes, split_scenes
 from gsim3d.data.check import check_scene
 from gsim3d.data.layouts import layout_of
@@ -60,10 +60,10 @@ def capture(
     force: bool = False,
     say: Callable[[str], None] = print,
 ) -> dict:
-    """Turns films into a simulator; finished steps are skipped when called again.
+    """Turns videos into a simulator; finished steps are skipped when called again.
 
     Args:
-        folder: films of one take, or a folder of films for each; scenes of any layout with cameras are used as given.
+        folder: videos of one take, or a folder of videos for each; scenes of any layout with cameras are used as given.
         out: run folder. Delete a step's file there to repeat it and what follows.
         board, scale: see :func:`gsim3d.capture.calibrate.calibrate`.
         minutes: time to train.
@@ -77,8 +77,8 @@ def capture(
         The content of metrics.json.
 
     Raises:
-        InputError: films or cameras cannot be used; the message names angles or reprojection errors. Or ``out`` was
-            started with other films, cameras or settings.
+        InputError: videos or cameras cannot be used; the message names angles or reprojection errors. Or ``out`` was
+            started with other videos, cameras or settings.
     """
     folder, out = Path(folder), Path(out)
     if not folder.is_dir():
@@ -117,7 +117,7 @@ class _Run:
     say: Callable[[str], None]
 
     def given(self) -> dict[str, Any]:
-        """Returns what the run folder belongs to, by name: settings, pretrained depth, cameras and films."""
+        """Returns what the run folder belongs to, by name: settings, pretrained depth, cameras and videos."""
         depth = [self.depth[0], Path(self.depth[1]).name] if self.depth else None
         where = os.path.relpath(self.folder.resolve(), self.out.resolve())
         found = {"DIR": where, "device": self.device, "minutes": self.minutes, "depth": depth}
@@ -125,12 +125,12 @@ class _Run:
         for take in self.takes():
             file = take / layout_of(take).FILE
             states = {file: f"sha256 {sha256_of(file)}"} if file.is_file() else {}
-            states |= {film: f"{film.stat().st_size} bytes of {int(film.stat().st_mtime)}" for film in films_in(take)}
+            states |= {clip: f"{clip.stat().st_size} bytes of {int(clip.stat().st_mtime)}" for clip in clips_in(take)}
             found |= {file.relative_to(self.folder).as_posix(): state for file, state in states.items()}
         return found
 
     def check_same(self) -> None:
-        """Raises InputError if the run folder belongs to other films or settings; both may have moved together."""
+        """Raises InputError if the run folder belongs to other videos or settings; both may have moved together."""
         if (self.out / RECORD).is_file() and (self.out / "check.json").is_file():
             before, given = read_json(self.out / RECORD), self.given()
             if changed := [name for name in (*given, *before) if before.get(name) != given.get(name)]:
@@ -151,7 +151,7 @@ class _Run:
         return read_json(file)
 
     def takes(self) -> list[Path]:
-        """Returns the scenes in the folder; films without cameras are none."""
+        """Returns the scenes in the folder; videos without cameras are none."""
         with suppress(InputError):
             return find_scenes(self.folder)
         return []
@@ -160,19 +160,19 @@ class _Run:
         return find_scenes(self.out / "scenes" / part)
 
     def calibrate(self, board: Board | None, scale) -> None:
-        """Writes cameras.json of films that have none; given ones are kept."""
+        """Writes cameras.json of videos that have none; given ones are kept."""
         scenes, below = self.takes(), [path for path in sorted(self.folder.iterdir()) if path.name != BOARD]
-        takes = [self.folder] if self.folder in scenes or films_in(self.folder) else below
-        filmed = [take for take in takes if take not in scenes and take.name[0] != "." and films_in(take)]
-        if not filmed and not scenes:
-            raise InputError(f"{self.folder} contains no scene (see docs/reference/data.md), and no films <camera>.mp4")
-        if not filmed:
+        takes = [self.folder] if self.folder in scenes or clips_in(self.folder) else below
+        recorded = [take for take in takes if take not in scenes and take.name[0] != "." and clips_in(take)]
+        if not recorded and not scenes:
+            raise InputError(f"{self.folder} contains no scene (docs/reference/data.md), and no videos <camera>.mp4")
+        if not recorded:
             unused = "; --board and --scale have no effect: delete cameras.json to repeat it" if board or scale else ""
             self.say(f"calibrate: done, or cameras given ({', '.join(path.name for path in scenes)}){unused}")
             return
         started = self.out / "calibrating"  # exists while cameras.json of several takes are written
         if scenes and takes is below and not started.is_file():
-            both = f"{filmed[0]}: has films but no {FILE}, unlike {scenes[0]}"
+            both = f"{recorded[0]}: has videos but no {FILE}, unlike {scenes[0]}"
             raise InputError(f"{both}: give its cameras, or calibrate all takes (gsim3d calibrate {self.folder})")
         started.touch()
         try:
@@ -196,7 +196,7 @@ class _Run:
             cameras = f"{', '.join(scene.camera_names)} of {list(scene.recorded_sizes)} pixels"
             if cameras != (rig := rig or cameras):
                 raise InputError(f"{path}: has cameras {cameras}, other takes {rig}; give it a folder of its own")
-            extra = [film.name for film in films_in(path) if film.stem not in scene.camera_names]
+            extra = [clip.name for clip in clips_in(path) if clip.stem not in scene.camera_names]
             own += [f"{path / FILE}: has no camera of {', '.join(extra)}: calibrate again"] if extra else []
             angles = check.angles(scene.recording.viewmats[0])
             errors = {} if own else check.match_errors(scene, angles)
@@ -320,7 +320,7 @@ class _Run:
                 for own, value in zip(values.values(), found, strict=True):
                     own += [value] if np.isfinite(found).all() else []
         if not values["model"]:
-            raise InputError(f"{self.out / 'scenes' / 'test'}: no moving body is visible; film longer, or more takes")
+            raise InputError(f"{self.out / 'scenes' / 'test'}: no moving body is visible; record longer, or more takes")
         differences = np.subtract(values["model"], values["constant"])
         gain, count = float(differences.mean()), len(differences)
         error = float(np.std(differences, ddof=1) / np.sqrt(count)) if count > 1 else None

@@ -1,4 +1,4 @@
-"""Calibration by structure from motion (COLMAP) of the still background of each film."""
+"""Calibration by structure from motion (COLMAP) of the still background of each video."""
 
 import tempfile
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from gsim3d.capture.board import Calibrated
-from gsim3d.capture.films import Film
+from gsim3d.capture.clips import Clip
 from gsim3d.data.cameras import focus, inverse, positions_and_axes
 from gsim3d.data.masks import background_image
 from gsim3d.data.recording import Problems
@@ -18,7 +18,7 @@ from gsim3d.errors import InputError
 MIN_POINTS = 12  # of a camera
 
 
-def calibrate_sfm(films: Sequence[Film]) -> list[Calibrated]:
+def calibrate_sfm(clips: Sequence[Clip]) -> list[Calibrated]:
     """Calibrates cameras by features that their backgrounds share.
 
     The world's origin is the point that the cameras look at, z the mean of their upward directions, and the mean
@@ -31,15 +31,15 @@ def calibrate_sfm(films: Sequence[Film]) -> list[Calibrated]:
         import pycolmap
     except ImportError as error:
         raise InputError(
-            "calibration without a board needs pycolmap: pip install 'gsim3d[capture]' (or film a board: --board)"
+            "calibration without a board needs pycolmap: pip install 'gsim3d[capture]' (or record a board: --board)"
         ) from error
     with tempfile.TemporaryDirectory() as temporary, ExitStack() as after:
         images, database = Path(temporary) / "images", Path(temporary) / "features.db"
         images.mkdir()
-        for film in films:
-            video = film.video
+        for clip in clips:
+            video = clip.video
             background = background_image(lambda at: np.stack([*video.read(at, Problems())]), len(video.times))
-            cv2.imwrite(str(images / f"{film.name}.png"), background[..., ::-1])
+            cv2.imwrite(str(images / f"{clip.name}.png"), background[..., ::-1])
         after.callback(setattr, pycolmap.logging, "minloglevel", pycolmap.logging.minloglevel)
         pycolmap.logging.minloglevel = pycolmap.logging.FATAL  # a missing model is an error below
         options = pycolmap.IncrementalPipelineOptions()
@@ -51,19 +51,19 @@ def calibrate_sfm(films: Sequence[Film]) -> list[Calibrated]:
         models = pycolmap.incremental_mapping(database, images, temporary, options)
     found = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
     registered = {Path(image.name).stem: image for image in found.images.values() if image.has_pose} if found else {}
-    lost = [film.name for film in films if film.name not in registered]
+    lost = [clip.name for clip in clips if clip.name not in registered]
     if lost:
         raise InputError(
-            f"structure from motion connects {len(registered)} of {len(films)} cameras, without {', '.join(lost)}: "
-            "their images share too few features; move the cameras closer together, add texture to the scene, or film "
+            f"structure from motion connects {len(registered)} of {len(clips)} cameras, without {', '.join(lost)}: "
+            "their images share too few features; move the cameras closer together, add texture, or record "
             "a board (--board)"
         )
-    poses = (registered[film.name].cam_from_world().matrix() for film in films)
+    poses = (registered[clip.name].cam_from_world().matrix() for clip in clips)
     viewmats = _upright(np.stack([np.vstack([pose, [0, 0, 0, 1]]) for pose in poses]))
-    return [_camera(film, found, registered[film.name], pose) for film, pose in zip(films, viewmats, strict=True)]
+    return [_camera(clip, found, registered[clip.name], pose) for clip, pose in zip(clips, viewmats, strict=True)]
 
 
-def _camera(film: Film, model, image, viewmat: np.ndarray) -> Calibrated:
+def _camera(clip: Clip, model, image, viewmat: np.ndarray) -> Calibrated:
     camera = model.cameras[image.camera_id]
     K = np.array(camera.calibration_matrix())
     K[:2, 2] -= 0.5  # the first pixel's centre is at 0.5 in COLMAP
@@ -73,9 +73,9 @@ def _camera(film: Film, model, image, viewmat: np.ndarray) -> Calibrated:
         if p.has_point3D()
     ]
     if len(errors) < MIN_POINTS:
-        raise InputError(f"camera {film.name}: shares only {len(errors)} points with the others; at least {MIN_POINTS}")
+        raise InputError(f"camera {clip.name}: shares only {len(errors)} points with the others; at least {MIN_POINTS}")
     distortion = np.array([camera.params[3], 0, 0, 0, 0])
-    return Calibrated(film.name, film.size, K, distortion, viewmat, float(np.sqrt(np.mean(np.square(errors)))), 1)
+    return Calibrated(clip.name, clip.size, K, distortion, viewmat, float(np.sqrt(np.mean(np.square(errors)))), 1)
 
 
 def _upright(viewmats: np.ndarray) -> np.ndarray:

@@ -1,18 +1,18 @@
-"""Computes intrinsics, poses and time offsets of films, and writes cameras.json.
+"""Computes intrinsics, poses and time offsets of videos, and writes cameras.json.
 
-DIR holds one film a camera, <camera>.mp4, or one folder of such films for each take. The cameras must not move.
+DIR holds one video a camera, <camera>.mp4, or one folder of such videos for each take. The cameras must not move.
 
-With --board, films of a ChArUco board lie in DIR/board (or the films show it themselves): move the board slowly,
+With --board, videos of a ChArUco board lie in DIR/board (or the videos show it themselves): move the board slowly,
 tilted, into all corners of every image, then lay it on the floor in view of a camera. The world is the
 board at the end: z points out of its printed side, lengths are metres. Without --board, COLMAP matches features of
 the still background (pip install 'gsim3d[capture]'); lengths are metres with --scale only.
 
-Films that start at different times are aligned by the motion that they show, if it then agrees clearly better. Writes
-cameras.json beside the films (docs/reference/data.md, videos), with the reprojection error of each camera.
+Videos that start at different times are aligned by the motion that they show, if it then agrees clearly better. Writes
+cameras.json beside the videos (docs/reference/data.md, videos), with the reprojection error of each camera.
 
 examples:
-  gsim3d calibrate films --board 7 5 0.04
-  gsim3d calibrate films --scale left right 1.2
+  gsim3d calibrate videos --board 7 5 0.04
+  gsim3d calibrate videos --scale left right 1.2
 """
 
 import argparse
@@ -23,9 +23,9 @@ from gsim3d.errors import InputError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("folder", metavar="DIR", help="folder with the films of a take, or with a folder for each take")
+    parser.add_argument("folder", metavar="DIR", help="folder with the videos of a take, or a folder for each take")
     add_calibration(parser)
-    parser.add_argument("--synchronous", action="store_true", help="the films start at one time: do not align them")
+    parser.add_argument("--synchronous", action="store_true", help="the videos start at one time: do not align them")
     parser.add_argument("--force", action="store_true", help="also write a calibration that does not fit")
 
 

@@ -9,7 +9,7 @@ FILE's suffix chooses the format (docs/reference/splat_formats.md has their boun
 examples:
   gsim3d export runs/ball --to ball.usdc                  all predicted frames of gsim3d simulate
   gsim3d export runs/ball --frame -1 --to ball.spz        the last one
-  gsim3d export runs/ball --to ball.mp4 --size 720        a film from an orbiting camera, with the time
+  gsim3d export runs/ball --to ball.mp4 --size 720        a video from an orbiting camera, with the time
   gsim3d export garden.ply --to orbit.mp4                 once around a single frame, in six seconds
   gsim3d export runs/ball --scene data/elastic/ball/0000 --to ball.html    truth beside prediction; also .mp4
   gsim3d export garden.ply --to garden.splat

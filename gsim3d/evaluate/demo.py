@@ -24,7 +24,7 @@ from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, PhaseCo
 from gsim3d.train.log import memory_gib
 from gsim3d.train.loop import Trainer
 from gsim3d.train.restore import restore
-from gsim3d.viewer.films import film_frames
+from gsim3d.viewer.clips import clip_frames
 
 _phase = partial(PhaseConfig, batch=2, target_views=2, warm_up=0.1)
 
@@ -180,7 +180,7 @@ def _pictures(out: Path, predictor: _Predictor, scenes: list, summary: dict) -> 
     pictures.write_curves(made[1], summary, scene.fps, ("psnr", "psnr_masked"))
     pictures.write_overview(made[2], restored, scene, prediction, rendered, cam)
     rows = {"truth": np.concatenate(truth, 1), "predicted": np.concatenate(images, 1)}
-    write_video(made[0], film_frames(rows, scene.fps, prediction.n_encoded), scene.fps)
+    write_video(made[0], clip_frames(rows, scene.fps, prediction.n_encoded), scene.fps)
 
 
 def comparisons(summary: dict) -> list[tuple[str, float, float]]:

@@ -25,7 +25,7 @@ from gsim3d.nn.gaussian_head import render
 from gsim3d.numerics.trust import draw_values
 from gsim3d.state import last_steps
 from gsim3d.train.restore import Restored
-from gsim3d.viewer.films import film_frames, turbo
+from gsim3d.viewer.clips import clip_frames, turbo
 from gsim3d.viewer.player import View, write_player
 
 SPLAT_SIZE = 320  # pixels, height of the picture of the Gaussians
@@ -101,7 +101,7 @@ def write_prediction(
         rows = {"truth": truth, "predicted": np.stack(images)}
         if bounds is not None:
             rows = bound_images(restored, scene, prediction, cams, first, bounds) | rows
-        write_video(part / "rollout.mp4", film_frames(rows, scene.fps, prediction.n_encoded), scene.fps)
+        write_video(part / "rollout.mp4", clip_frames(rows, scene.fps, prediction.n_encoded), scene.fps)
         write_gaussians(part / "gaussians", restored, prediction, scene.fps)
         last = last_steps(prediction.particles, 2**restored.simulator.config.dynamics.history_bits)
         write_particles(part / STATE, last, restored.checkpoint.digest)

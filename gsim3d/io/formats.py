@@ -44,7 +44,7 @@ FORMATS = {
 
 
 def format_of(path: str | Path, others: Sequence[str] = ()) -> tuple[str, Format]:
-    """Suffix and format of a file name; an error also names ``others``, suffixes of films.
+    """Suffix and format of a file name; an error also names ``others``, suffixes of videos.
 
     Raises:
         InputError: no format has this suffix.

@@ -11,7 +11,7 @@ from gsim3d.io.files import new_output_path, with_parents
 from gsim3d.io.formats import format_of, write_splats
 from gsim3d.io.orbit import orbit_frames
 from gsim3d.state import Gaussians
-from gsim3d.viewer.films import write_time
+from gsim3d.viewer.clips import write_time
 from gsim3d.viewer.player import write_player
 
 FPS = 24.0

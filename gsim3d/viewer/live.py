@@ -21,8 +21,8 @@ from gsim3d.io.video import write_video
 from gsim3d.math.rotations import rotation_matrices, rotation_to_quat
 from gsim3d.state import ASLEEP, DYNAMIC, FROZEN, Gaussians, Particles
 from gsim3d.viewer import player
+from gsim3d.viewer.clips import clip_frames, turbo
 from gsim3d.viewer.export import write_frames
-from gsim3d.viewer.films import film_frames, turbo
 
 COLORINGS = ("appearance", "velocity", "activity", "latents", "trust")
 AWAKE_COLOR, FROZEN_COLOR, ASLEEP_COLOR = (0.95, 0.5, 0.1), (0.55, 0.55, 0.55), (0.2, 0.45, 0.95)
@@ -330,7 +330,7 @@ class Target:
         with_parents(out)
         if out.suffix.lower() == ".mp4":
             panels = {"truth": truth[:, None], "predicted": predicted[:, None]}
-            write_video(out, film_frames(panels, self.fps), self.fps)
+            write_video(out, clip_frames(panels, self.fps), self.fps)
         else:
             seen = scene.cameras_at([cam], [self.first])
             view = player.View(seen.viewmats[0].numpy(), seen.Ks[0].numpy(), seen.width, seen.height)

@@ -1,4 +1,4 @@
-"""Takes of a ball that swings over a checkered disc, filmed by still cameras, as films beside cameras.json."""
+"""Takes of a ball that swings over a checkered disc, recorded by still cameras, as videos beside cameras.json."""
 
 import json
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from tests.capture.made_films import look_at
+from tests.capture.made_clips import look_at
 from tests.tiny_scenes import draw
 
 SIZE, FPS = 96, 30
@@ -22,19 +22,19 @@ def cameras_at(degrees):
 
 
 def write_take(folder: Path, degrees=(0, 25, 50), *, n_frames=72, starts=None, lens=None, **keys) -> Path:
-    """``starts``: frames that each film begins late; ``keys`` of cameras.json."""
+    """``starts``: frames that each video begins late; ``keys`` of cameras.json."""
     folder.mkdir(parents=True)
     K = np.array([[1.3 * SIZE, 0, SIZE / 2], [0, 1.3 * SIZE, SIZE / 2], [0, 0, 1]])
     cameras = []
     for number, viewmat in enumerate(cameras_at(degrees)):
         name, late = NAMES[number], 0 if starts is None else starts[number]
-        film = cv2.VideoWriter(str(folder / f"{name}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), FPS, (SIZE, SIZE))
+        clip = cv2.VideoWriter(str(folder / f"{name}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), FPS, (SIZE, SIZE))
         for frame in range(late, late + n_frames):
             time = frame / FPS
             center = np.array([0.5 * np.sin(3 * time), 0.45 * np.cos(2.3 * time + 0.5), 0.5 + 0.15 * np.sin(5 * time)])
             rgb, _ = draw(viewmat, K, SIZE, center, 0.18, np.array([0.9, 0.3, 0.2]))
-            film.write(rgb[..., ::-1])
-        film.release()
+            clip.write(rgb[..., ::-1])
+        clip.release()
         entry = {"name": name, "size": [SIZE, SIZE], "K": K.tolist(), "offset": late / FPS}
         cameras.append({**entry, "R": viewmat[:3, :3].tolist(), "T": viewmat[:3, 3].tolist()})
     (folder / "cameras.json").write_text(json.dumps({"cameras": cameras, **keys}))

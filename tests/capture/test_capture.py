@@ -21,7 +21,7 @@ from gsim3d.nn.multiview_encoder import Encoder, EncoderConfig
 from gsim3d.nn.multiview_encoder.config import ViTConfig
 from gsim3d.train.config import TrainConfig
 from gsim3d.train.restore import restore
-from tests.capture.made_films import rig, write_textured_films
+from tests.capture.made_clips import rig, write_textured_clips
 from tests.capture.made_takes import cameras_at, write_take
 from tests.data.made_hocap import write_hocap
 
@@ -82,17 +82,17 @@ def edit_cameras(folder, change):
     (folder / "cameras.json").write_text(json.dumps(content))
 
 
-def test_a_run_belongs_to_its_films_cameras_and_depth(tmp_path):
-    take, depth = write_take(tmp_path / "films" / "a", n_frames=4), tmp_path / "model.safetensors"
+def test_a_run_belongs_to_its_clips_cameras_and_depth(tmp_path):
+    take, depth = write_take(tmp_path / "videos" / "a", n_frames=4), tmp_path / "model.safetensors"
     depth.write_bytes(b"one")
-    run = bare_run(tmp_path / "films", tmp_path / "run", depth=("tiny", str(depth)))
+    run = bare_run(tmp_path / "videos", tmp_path / "run", depth=("tiny", str(depth)))
     (run.out / "check.json").write_text("{}")
     (run.out / "capture.json").write_text(json.dumps(run.given()))
     run.check_same()
-    film, cameras = take / "left.avi", take / "cameras.json"
+    clip, cameras = take / "left.avi", take / "cameras.json"
     for file, change in (
         (depth, lambda: depth.write_bytes(b"two")),
-        (film, lambda: film.write_bytes(film.read_bytes() + b"0")),
+        (clip, lambda: clip.write_bytes(clip.read_bytes() + b"0")),
         (cameras, lambda: edit_cameras(take, lambda entries: entries[0].update(offset=0.5))),
         (cameras, cameras.unlink),
     ):
@@ -111,15 +111,15 @@ def test_a_run_belongs_to_its_films_cameras_and_depth(tmp_path):
 def test_given_cameras_are_kept(tmp_path, monkeypatch):
     calls = []
     monkeypatch.setattr("gsim3d.capture.run.calibrate", lambda folder, **_: calls.append(folder))
-    film = write_take(tmp_path / "a", n_frames=4) / "left.avi"
+    clip = write_take(tmp_path / "a", n_frames=4) / "left.avi"
     for inner in ("original", "masks"):
         (tmp_path / "a" / inner).mkdir()
-        shutil.copy(film, tmp_path / "a" / inner)
+        shutil.copy(clip, tmp_path / "a" / inner)
     bare_run(tmp_path / "a", tmp_path / "run").calibrate(None, None)
     mixed = bare_run(tmp_path, tmp_path / "run")
     mixed.calibrate(None, None)
     write_take(tmp_path / "b", n_frames=4).joinpath("cameras.json").unlink()
-    with pytest.raises(InputError, match=r"b: has films but no cameras.json, unlike \S*a: give its cameras"):
+    with pytest.raises(InputError, match=r"b: has videos but no cameras.json, unlike \S*a: give its cameras"):
         mixed.calibrate(None, None)
     assert not calls
     (tmp_path / "run" / "calibrating").touch()  # an interrupted call wrote those of a
@@ -128,18 +128,18 @@ def test_given_cameras_are_kept(tmp_path, monkeypatch):
 
 
 def test_every_take_is_checked(tmp_path, monkeypatch):
-    write_take(tmp_path / "films" / "a", n_frames=16)
-    write_take(tmp_path / "films" / "b", (0, 60, 180), n_frames=16)
-    run = bare_run(tmp_path / "films", tmp_path / "run")
-    with pytest.raises(InputError, match="films/b: the views do not overlap"):
+    write_take(tmp_path / "videos" / "a", n_frames=16)
+    write_take(tmp_path / "videos" / "b", (0, 60, 180), n_frames=16)
+    run = bare_run(tmp_path / "videos", tmp_path / "run")
+    with pytest.raises(InputError, match="videos/b: the views do not overlap"):
         run.check()
-    edit_cameras(tmp_path / "films" / "b", lambda entries: entries.reverse())
-    with pytest.raises(InputError, match=r"films/b: has cameras right, middle, left .* other takes left, middle"):
+    edit_cameras(tmp_path / "videos" / "b", lambda entries: entries.reverse())
+    with pytest.raises(InputError, match=r"videos/b: has cameras right, middle, left .* other takes left, middle"):
         run.check()
-    shutil.rmtree(tmp_path / "films" / "b")
+    shutil.rmtree(tmp_path / "videos" / "b")
     monkeypatch.setattr("tests.capture.made_takes.SIZE", 80)
-    write_take(tmp_path / "films" / "b", n_frames=16)
-    with pytest.raises(InputError, match=r"films/b: has cameras .*\(80, 80\).* pixels, other takes .*\(96, 96\)"):
+    write_take(tmp_path / "videos" / "b", n_frames=16)
+    with pytest.raises(InputError, match=r"videos/b: has cameras .*\(80, 80\).* pixels, other takes .*\(96, 96\)"):
         run.check()
 
 
@@ -153,10 +153,10 @@ def test_depths_are_those_of_the_cameras_of_each_take(tmp_path):
 
 def test_a_repeated_proposal_leaves_no_old_scenes(tmp_path):
     for name in ("b", "c"):
-        write_take(tmp_path / "films" / name, n_frames=16)
-    run = bare_run(tmp_path / "films", tmp_path / "run")
+        write_take(tmp_path / "videos" / name, n_frames=16)
+    run = bare_run(tmp_path / "videos", tmp_path / "run")
     run.propose()
-    write_take(tmp_path / "films" / "a", n_frames=16)
+    write_take(tmp_path / "videos" / "a", n_frames=16)
     run.propose()
     train, test = ([path.name for path in run.scenes(part)] for part in ("train", "test"))
     assert train == ["b", "c"] and test == ["a"]
@@ -188,8 +188,8 @@ def test_pretrained_depth_is_trained_on(run, tmp_path, monkeypatch, capsys):
 
 def test_takes_of_equal_names_stay_apart(tmp_path):
     for body in ("ball", "box"):
-        write_take(tmp_path / "films" / body / "0000", n_frames=24)
-    run = _Run(tmp_path / "films", tmp_path / "run", "cpu", 1.0, None, False, lambda _: None)
+        write_take(tmp_path / "videos" / body / "0000", n_frames=24)
+    run = _Run(tmp_path / "videos", tmp_path / "run", "cpu", 1.0, None, False, lambda _: None)
     run.propose()
     assert [path.name for path in run.scenes("train")] == ["box_0000"]
     assert [path.name for path in run.scenes("test")] == ["ball_0000"]
@@ -197,9 +197,9 @@ def test_takes_of_equal_names_stay_apart(tmp_path):
 
 def test_takes_that_are_too_short_are_named(tmp_path):
     for name, n_frames in (("a", 24), ("b", 24), ("c", 6)):
-        write_take(tmp_path / "films" / name, n_frames=n_frames)
-    run = _Run(tmp_path / "films", tmp_path / "run", "cpu", 1.0, None, False, lambda _: None)
-    with pytest.raises(InputError, match=r"films/c: has 3 usable frames at 15 a second, needs 4"):
+        write_take(tmp_path / "videos" / name, n_frames=n_frames)
+    run = _Run(tmp_path / "videos", tmp_path / "run", "cpu", 1.0, None, False, lambda _: None)
+    with pytest.raises(InputError, match=r"videos/c: has 3 usable frames at 15 a second, needs 4"):
         run.propose()
 
 
@@ -226,7 +226,7 @@ def test_prepared_scenes_are_cropped_and_synchronised_with_their_cameras(run):
     scene, proposal = Scene.open(train), json.loads((run / "proposal.json").read_text())
     assert scene.fps == 15 and scene.n_cams == 3 and [scene.width, scene.height] == proposal["size"]
     assert proposal["held_out_camera"] is None
-    time = 2 / 30  # the latest film begins at frame 2
+    time = 2 / 30  # the latest video begins at frame 2
     low, high = scene.bounds
     for step in (0, 5):
         at = time + step / 15
@@ -259,7 +259,7 @@ def test_views_far_apart_are_refused_with_their_angles(tmp_path, capsys):
 
 def test_a_wrong_camera_is_refused_by_the_error_of_matches(tmp_path):
     cameras = rig((-15, 0, 15), 1.0)
-    write_textured_films(tmp_path, cameras)
+    write_textured_clips(tmp_path, cameras)
     entries = [
         {"name": name, "size": [400, 300], "K": K.tolist(), "R": pose[:3, :3].tolist(), "T": pose[:3, 3].tolist()}
         for name, K, pose in cameras
@@ -330,7 +330,7 @@ def test_a_body_that_rests_and_leaves_is_no_ghost():
     scenery = cv2.resize(rng.integers(40, 200, (12, 16, 3)).astype(np.uint8), (128, 96), interpolation=cv2.INTER_LINEAR)
     frames = np.repeat(scenery[None], 40, 0)
     for step in range(40):
-        x = 30 if step < 26 else 30 + 6 * (step - 25)  # rests for 65 % of the film
+        x = 30 if step < 26 else 30 + 6 * (step - 25)  # rests for 65 % of the video
         if x < 120:
             frames[step, 30:60, x : x + 24] = (250, 20, 30)
     frames = (frames + rng.normal(0, 2, frames.shape)).clip(0, 255).astype(np.uint8)

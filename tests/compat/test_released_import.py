@@ -297,7 +297,7 @@ def test_wrong_setting_is_named_with_its_file(capsys, tmp_path):
 
 
 def test_imported_model_is_evaluated_at_its_own_size(capsys, tmp_path):
-    """Films of twice the size, with depth bounds of their own, are fitted to what the model was trained on."""
+    """Videos of twice the size, with depth bounds of their own, are fitted to what the model was trained on."""
     config = small_config()
     settings = changed(settings_of(config), "dataset.view_sampler.num_context_views", 2)
     files = write_release(tmp_path, random_weights(config), settings)

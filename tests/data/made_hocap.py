@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import yaml
 
-from tests.capture.made_films import look_at
+from tests.capture.made_clips import look_at
 
 SERIALS = ("105322251564", "037522251142", "043422252387")  # the second is an octal number without quotes
 SIZE, N_FRAMES = (160, 120), 32

@@ -1,4 +1,4 @@
-"""Films of real cameras: videos, odd sizes, lenses, backgrounds; the whole way through train, simulate, evaluate."""
+"""Videos of real cameras: videos, odd sizes, lenses, backgrounds; the whole way through train, simulate, evaluate."""
 
 import dataclasses
 import json

@@ -114,7 +114,7 @@ def test_late_videos_are_aligned_by_time(tmp_path):
 
 
 @pytest.mark.parametrize("offsets, off", [([0.024, 0.026], 0), ([0.0, 0.012], 6), ([0.12, 0.13, 0.125], 5)])
-@pytest.mark.parametrize("kind", ["films", "folders"])
+@pytest.mark.parametrize("kind", ["videos", "folders"])
 def test_offsets_of_fractions_of_a_frame(tmp_path, kind, offsets, off):
     """Offsets of 0.48 and 0.52 frames are not rounded to different steps."""
     names = [f"c{number}" for number in range(len(offsets))]
@@ -193,12 +193,12 @@ def test_interlaced_videos_are_read_or_refused(tmp_path, name, codec):
     """OpenCV 5 gives the same picture of whatever its memory held for each of their frames, without an error."""
     av = pytest.importorskip("av")
     with av.open(str(tmp_path / name), "w") as file:
-        film = file.add_stream(codec, rate=RATE, options={"flags": "+ilme+ildct", "x264-params": "interlaced=1"})
-        film.width, film.height, film.pix_fmt = 64, 48, "yuv420p"
+        clip = file.add_stream(codec, rate=RATE, options={"flags": "+ilme+ildct", "x264-params": "interlaced=1"})
+        clip.width, clip.height, clip.pix_fmt = 64, 48, "yuv420p"
         for frame in range(N_FRAMES):
             picture = np.full((48, 64, 3), 12 * frame, np.uint8)
-            file.mux(film.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
-        file.mux(film.encode())
+            file.mux(clip.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        file.mux(clip.encode())
     try:
         assert frames_of(Scene.open(write_scene(tmp_path, ["a"]))) == [list(range(N_FRAMES))]
     except InputError as error:

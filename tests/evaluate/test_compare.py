@@ -72,7 +72,7 @@ def without_digest(other):
     del other["scenes"]["a"]["digest"]
 
 
-def other_film(other):
+def other_clip(other):
     other["scenes"]["b"]["digest"] = "another"
 
 
@@ -96,7 +96,7 @@ def other_history(other):
     "damage, message",
     [
         (without_digest, "b.json: has no digest of the scored images of a"),
-        (other_film, "b.json: images, labels or target cameras of b differ"),
+        (other_clip, "b.json: images, labels or target cameras of b differ"),
         (fewer_scenes, r"b.json: different scenes: b is not scored there \(1 scenes differ\)"),
         (more_scenes, "b.json: different scenes: z is scored only there"),
         (other_steps, "b.json: 28 predicted steps, here 80"),

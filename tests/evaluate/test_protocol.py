@@ -80,12 +80,12 @@ def test_scenes_predicted_together_are_those_predicted_alone(restored, scene, tm
 
 def test_predictions_of_two_calls_are_not_mixed(restored, scene, tmp_path, monkeypatch):
     """The call that ends last is refused; what the other one has written stays as it is."""
-    prediction, write_film = predict(restored, scene, (0, 2), 1), pictures.write_video
+    prediction, write_clip = predict(restored, scene, (0, 2), 1), pictures.write_video
     other = tmp_path / ".out.part" / "frames"
     other.mkdir(parents=True)
 
     def while_another_ends(*arguments):
-        write_film(*arguments)
+        write_clip(*arguments)
         shutil.copytree(other.parent, tmp_path / "out")
 
     monkeypatch.setattr(pictures, "write_video", while_another_ends)

@@ -63,7 +63,7 @@ def image_of(camera, viewmat, middle, turn, painted, lit):
     return color.permute(2, 0, 1), reach > 0
 
 
-def filmed(velocity=VELOCITY, spin=SPIN, n_steps=4, n=3000, n_views=4, lit=True, seed=0):
+def recorded(velocity=VELOCITY, spin=SPIN, n_steps=4, n=3000, n_views=4, lit=True, seed=0):
     """Images of a textured ball that translates and rotates under a light, and encoded particles of its surface."""
     g = torch.Generator().manual_seed(seed)
     ball = torch.nn.functional.normalize(torch.randn(n, 3, generator=g), dim=1) * (RADIUS - INSIDE)
@@ -95,7 +95,7 @@ def motion_of(particles, found):
 @pytest.mark.parametrize("spin", [SPIN, (0.0, 0.0, 0.04), (0.0, 0.0, 0.0)])
 @pytest.mark.parametrize("lit", [False, True])
 def test_velocity_and_spin_under_any_light(spin, lit):
-    particles, frames = filmed(spin=spin, lit=lit)
+    particles, frames = recorded(spin=spin, lit=lit)
     velocity, turn = motion_of(particles, follow(particles, frames))
     assert (velocity - torch.tensor(VELOCITY)).norm() < 1e-3
     assert (turn - torch.tensor(spin)).norm() < 5e-3
@@ -104,7 +104,7 @@ def test_velocity_and_spin_under_any_light(spin, lit):
 @pytest.mark.parametrize("spin", [(0.0, 0.0, 0.3), (0.25, -0.1, 0.1)])
 def test_velocity_of_tumbling_body(spin):
     """A rotation of 0.9 rad since the oldest step needs the spin of the last step as a start."""
-    particles, frames = filmed(spin=spin)
+    particles, frames = recorded(spin=spin)
     particles = dataclasses.replace(particles, body=torch.ones_like(particles.means))
     found = follow(particles, frames)
     newest = last_steps(particles, 1).means
@@ -115,7 +115,7 @@ def test_velocity_of_tumbling_body(spin):
 
 def test_noisy_positions():
     """Encoded positions with an error of about 1 cm."""
-    particles, frames = filmed()
+    particles, frames = recorded()
     noise = 0.01 * torch.randn(particles.means.shape, generator=torch.Generator().manual_seed(1))
     noisy = dataclasses.replace(particles, means=particles.means + noise)
     velocity, turn = motion_of(noisy, follow(noisy, frames))
@@ -124,7 +124,7 @@ def test_noisy_positions():
 
 
 def test_only_movable_particles_of_newest_cloud():
-    particles, frames = filmed()
+    particles, frames = recorded()
     activity = particles.activity.clone()
     activity[-500:] = FROZEN
     found = follow(dataclasses.replace(particles, activity=activity), frames)
@@ -136,7 +136,7 @@ def test_only_movable_particles_of_newest_cloud():
 @pytest.mark.parametrize("n_steps", [2, 4])
 def test_gravity_gives_velocity_of_last_step(n_steps):
     """The correction is half of gravity for every step but one between the oldest and the newest."""
-    particles, frames = filmed(n_steps=n_steps)
+    particles, frames = recorded(n_steps=n_steps)
     gravity = torch.tensor([0.001, 0.0, -0.004])
     newest = particles.row_cloud() == n_steps - 1
     falls = gravity.expand(int(newest.sum()), 3)
@@ -148,12 +148,12 @@ def test_gravity_gives_velocity_of_last_step(n_steps):
 
 
 def test_one_step_has_no_velocity():
-    particles, frames = filmed(n_steps=1)
+    particles, frames = recorded(n_steps=1)
     assert not follow(particles, frames).any()
 
 
 def test_older_clouds_are_ignored():
-    particles, frames = filmed()
+    particles, frames = recorded()
     velocity = 0.01 * torch.rand(3)
     moved = torch.where((particles.row_cloud() == 0)[:, None], particles.means + 20 * velocity, particles.means)
     long_ago = dataclasses.replace(particles, means=moved, cloud_step=torch.tensor([0, 7, 8, 9]), known=None)
@@ -166,7 +166,7 @@ def test_older_clouds_are_ignored():
 
 
 def test_far_from_origin():
-    particles, frames = filmed()
+    particles, frames = recorded()
     far = torch.tensor([300.0, -200.0, 100.0])
     viewmats = frames.cameras.viewmats.clone()
     viewmats[:, :3, 3] -= viewmats[:, :3, :3] @ far
@@ -177,7 +177,7 @@ def test_far_from_origin():
 
 
 def test_any_order_of_images():
-    particles, frames = filmed()
+    particles, frames = recorded()
     expected = follow(particles, frames)
     assert_same_bits(follow(particles, frames, n_views=4), expected)
     order = torch.arange(16).reshape(4, 4).T.flatten()
@@ -188,7 +188,7 @@ def test_any_order_of_images():
 
 
 def test_fewer_views():
-    particles, frames = filmed()
+    particles, frames = recorded()
     kept = torch.arange(2, 16)
     fewer = dataclasses.replace(
         frames, images=frames.images[kept], cameras=frames.cameras.select(kept), dynamic=frames.dynamic[kept]
@@ -198,7 +198,7 @@ def test_fewer_views():
 
 
 def test_batch_equals_single_scenes():
-    one, other = filmed(), filmed(velocity=(0.0, 0.01, 0.0), spin=(0.0, 0.03, 0.0), seed=1)
+    one, other = recorded(), recorded(velocity=(0.0, 0.01, 0.0), spin=(0.0, 0.03, 0.0), seed=1)
     particles = batch([one[0], other[0]])
     image_cloud = torch.cat([one[1].cameras.image_cloud, other[1].cameras.image_cloud + 4])
     cameras = ring(4, image_cloud.tolist())
@@ -212,13 +212,13 @@ def test_batch_equals_single_scenes():
 
 
 def test_blank_images_leave_displacement_of_means():
-    particles, frames = filmed(spin=(0.0, 0.0, 0.0))
+    particles, frames = recorded(spin=(0.0, 0.0, 0.0))
     dark = dataclasses.replace(frames, images=torch.zeros_like(frames.images))
     velocity, turn = motion_of(particles, follow(particles, dark))
     assert (velocity - torch.tensor(VELOCITY)).norm() < 1e-4 and turn.norm() < 1e-4
 
 
 def test_on_gpu(devices):
-    particles, frames = filmed()
+    particles, frames = recorded()
     expected, actual = (follow(particles.to(d), frames.to(d)).cpu() for d in devices)
     assert_close_relative_to_max(actual, expected, 1e-3)

@@ -70,7 +70,7 @@ def test_synthetic_batches_have_their_true_size(masked, bench):
 def test_benchmark_images_show_their_particles(bench):
     """A pixel's place projects into its middle, and lies on the body or on the ground."""
     scene, size = bench.surface_scene, 32
-    _, body, places = scene.film(2, size)
+    _, body, places = scene.clip(2, size)
     viewmats = scene.poses().float()[:, None, None]
     seen = (viewmats[..., :3, :3] @ places[..., None])[..., 0] + viewmats[..., :3, 3]
     pixels = (scene.intrinsics(size).float() @ (seen / seen[..., 2:])[..., None])[..., 0]
@@ -84,7 +84,7 @@ def test_benchmark_images_show_their_particles(bench):
 
 
 def test_particles_of_the_benchmark_sink_with_the_body(bench, tmp_path):
-    """Encoded particles lie where the film shows the body, and simulated ones move as it does, within a millimetre."""
+    """Encoded particles lie where the video shows the body, and simulated ones move as it does, within a millimetre."""
     scene, config = bench.surface_scene, presets.tiny()
     torch.manual_seed(0)
     simulator = Simulator(config).eval()

@@ -70,7 +70,7 @@ def cameras(cams: Sequence[int], image_cloud: Tensor, size: int) -> Cameras:
     return Cameras(poses()[list(cams)].float(), Ks, *bounds, image_cloud, size, size)
 
 
-def film(step: int, size: int) -> tuple[Tensor, Tensor, Tensor]:
+def clip(step: int, size: int) -> tuple[Tensor, Tensor, Tensor]:
     """What the 12 cameras see: images [12, 3, size, size], where the body is [12, size, size], and the places in the
     world that the pixels show [12, size, size, 3]."""
     viewmats, K = poses(), intrinsics(size)
@@ -96,9 +96,9 @@ def frames(n_scenes: int, views: Sequence[Sequence[int]], size: int, masked: boo
     """The first ``len(views)`` steps of as many equal scenes, step t seen by the cameras ``views[t]``; and the places
     [N, 3] of the particles that an encoder makes of them. On the CPU."""
     n_steps, n_views = len(views), len(views[0])
-    films = [film(step, size) for step in range(n_steps)]
+    clips = [clip(step, size) for step in range(n_steps)]
     images, body, places = (
-        torch.cat([films[t][kind][list(views[t])] for t in range(n_steps)]).repeat(n_scenes, 1, 1, *[1] * rest)
+        torch.cat([clips[t][kind][list(views[t])] for t in range(n_steps)]).repeat(n_scenes, 1, 1, *[1] * rest)
         for kind, rest in ((0, 1), (1, 0), (2, 1))
     )
     seen = [cam for step in views for cam in step] * n_scenes

@@ -4,7 +4,7 @@
     torchrun --nproc-per-node 4 tools/bench/training.py --device cuda --case recomputed  # this batch for each process
 
 The step is the one of `gsim3d train`: encode, 12 steps fed back, images of 5 views at all 16 steps, gradients,
-clipping, AdamW, averaged weights; with drop path, shuffled curves and deterministic algorithms. The film, the masks and
+clipping, AdamW, averaged weights; with drop path, shuffled curves and deterministic algorithms. The images, masks and
 where particles lie are those of surface_scene.py. With several processes every one gets ``--batch`` scenes; the
 efficiency of scaling is the time of a step in one process, measured before they begin, over the time in all of them.
 """

@@ -38,7 +38,7 @@ class Progress:
 
     step: int = 0  #: optimizer steps
     windows: int = 0  #: training windows with simulated steps
-    seconds: float = 0.0  #: of training, without filming and scoring
+    seconds: float = 0.0  #: of training, without videos and scoring
     next_trajectory: int = 0  #: number of the first trajectory that was not handed out
     n_skipped: int = 0  #: steps that changed nothing
     needed: dict[str, Any] = field(default_factory=dict)  #: capacity of CUDA graphs, of CapturedLoss

@@ -10,7 +10,7 @@ from gsim3d.evaluate.pictures import as_bytes, true_images
 from gsim3d.evaluate.protocol import default_views, predict, render_steps, score_scenes
 from gsim3d.io import write_video
 from gsim3d.train.restore import Restored, restore
-from gsim3d.viewer.films import film_frames
+from gsim3d.viewer.clips import clip_frames
 
 SHOWN = 3  # trajectories in the video
 METRICS = ("psnr_masked", "psnr_body")
@@ -51,4 +51,4 @@ def write_comparison(path: Path, restored: Restored, scenes: Sequence[Scene]) ->
         truth.append(true_images(scene, targets[:1], range(n_steps)))
         predicted.append(as_bytes(render_steps(restored, prediction.particles, scene, targets[:1])))
     rows = {"truth": np.concatenate(truth, 1), "predicted": np.concatenate(predicted, 1)}
-    write_video(path, film_frames(rows, scenes[0].fps, restored.data.history), scenes[0].fps)
+    write_video(path, clip_frames(rows, scenes[0].fps, restored.data.history), scenes[0].fps)

@@ -31,7 +31,7 @@ RIGHT = {
     "generate": "elastic --out {out} --frames 2 --trajectories 1 --size 8 --processes 1",
     "bound": "{good}/data --given 34.4 --out {out}",
     "check-data": "{good}/data --out {out}.png",
-    "calibrate": "{good}/none --scale a b 1",  # films are not there: no run is started
+    "calibrate": "{good}/none --scale a b 1",  # videos are not there: no run is started
     "capture": "{good}/none --out {out} --minutes 0.01 --depth tiny {good}/model.safetensors",
     "train": "{good}/train.yaml --data {good}/data --out {out} --until 1",
     "simulate": "{good}/model.safetensors {good}/data/ball/0000 --out {out} --steps 1",

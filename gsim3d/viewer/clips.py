@@ -1,4 +1,4 @@
-"""Frames of films: labelled panels of a size that screens like."""
+"""Frames of videos: labelled panels of a size that screens like."""
 
 from collections.abc import Iterator, Mapping
 
@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 
 PANEL = 512  # pixels, least height of a panel
-WIDEST = 3840  # pixels of a film, where its images are not wider themselves
+WIDEST = 3840  # pixels of a video, where its images are not wider themselves
 GAP = 4  # pixels of white between panels
 FONT, TEXT, SHADE = cv2.FONT_HERSHEY_SIMPLEX, 1 / 600, 0.4  # scale per pixel of a panel; brightness behind a text
 WHITE, ACCENT = (255, 255, 255), (255, 157, 77)
 
 
-def film_frames(rows: Mapping[str, np.ndarray], fps: float, n_given: int = 0) -> Iterator[np.ndarray]:
+def clip_frames(rows: Mapping[str, np.ndarray], fps: float, n_given: int = 0) -> Iterator[np.ndarray]:
     """Frames uint8 [H, W, 3] of even size: a row of panels for each label, a column a view, the time in seconds.
 
     ``rows`` is label -> images uint8 [S, V, H, W, 3], all of one shape; small ones are enlarged to PANEL. The last

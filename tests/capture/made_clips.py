@@ -1,11 +1,11 @@
-"""Films of a ChArUco board and of textured walls, with known cameras and start times."""
+"""Videos of a ChArUco board and of textured walls, with known cameras and start times."""
 
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from tools.films import board_film
+from tools.clips import board_clip
 
 SIZE, FPS, N_FRAMES = (400, 300), 30, 54
 LENS = np.array([-0.12, 0.04, 0.001, -0.0005, 0.0])
@@ -32,21 +32,21 @@ def rig(angles=(-25, 0, 30), distance=0.66):
     return cameras
 
 
-def write_board_films(folder: Path, board, cameras, starts, *, n_frames=N_FRAMES) -> Path:
-    """One film of each camera that begins ``starts[c]`` seconds after time 0; the board rests near the end."""
+def write_board_clips(folder: Path, board, cameras, starts, *, n_frames=N_FRAMES) -> Path:
+    """One video of each camera that begins ``starts[c]`` seconds after time 0; the board rests near the end."""
     folder.mkdir(parents=True, exist_ok=True)
     rng, viewer = np.random.default_rng(0), np.mean([np.linalg.inv(camera[2])[:3, 3] for camera in cameras], 0)
     for number, ((name, K, viewmat), start) in enumerate(zip(cameras, starts, strict=True)):
         writer = cv2.VideoWriter(str(folder / f"{name}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), FPS, SIZE)
         times = start + np.arange(n_frames) / FPS
-        for frame in board_film(board, K, viewmat, LENS, SIZE, times, n_frames / FPS - 0.4, viewer, number):
+        for frame in board_clip(board, K, viewmat, LENS, SIZE, times, n_frames / FPS - 0.4, viewer, number):
             writer.write((frame + rng.normal(0, 1.5, frame.shape)).clip(0, 255).astype(np.uint8))
         writer.release()
     return folder
 
 
-def write_textured_films(folder: Path, cameras, *, n_frames=8, seed=0) -> Path:
-    """Films of four textured walls and a floor, by pinhole cameras (``rig``), with a little noise."""
+def write_textured_clips(folder: Path, cameras, *, n_frames=8, seed=0) -> Path:
+    """Videos of four textured walls and a floor, by pinhole cameras (``rig``), with a little noise."""
     rng = np.random.default_rng(seed)
     walls = [  # corner and two sides, metres
         ([-0.6, -0.6, 0.0], [1.2, 0, 0], [0, 1.2, 0]),

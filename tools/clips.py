@@ -1,9 +1,9 @@
-"""Films of generated scenes as cheap cameras take them, and of a ChArUco board before the same cameras.
+"""Videos of generated scenes as cheap cameras take them, and of a ChArUco board before the same cameras.
 
-Films have a lens, noise, an exposure of their own, dropped frames (the one before is shown again) and start at
+Videos have a lens, noise, an exposure of their own, dropped frames (the one before is shown again) and start at
 different times. OUT/truth.json has the true cameras and start times.
 
-python -m tools.films DATA OUT --cameras 0 1 2
+python -m tools.clips DATA OUT --cameras 0 1 2
 """
 
 import argparse
@@ -20,20 +20,20 @@ from gsim3d.data import Scene, find_scenes
 from gsim3d.io import write_video
 
 BOARD = Board(5, 4, 0.25)
-SECONDS, AT_REST = 3.0, 0.5  # of the films of the board, and how long it lies still at their end
+SECONDS, AT_REST = 3.0, 0.5  # of the videos of the board, and how long it lies still at their end
 MARGIN, PIXELS = 0.5, 40  # white paper around the board in squares, and pixels of a square in its print
 SHARP = 2  # rays along each side of a pixel
 
 
 @dataclass(frozen=True)
 class Damage:
-    """What films suffer from."""
+    """What videos suffer from."""
 
     lens: tuple[float, ...] = (-0.12, 0.04, 0.001, -0.0005, 0.0)  #: k1 k2 p1 p2 k3
     noise: float = 3.0  #: standard deviation, of 255
     exposure: float = 0.1  #: largest relative deviation of a colour channel of a camera
     dropped: float = 0.02  #: fraction of frames
-    late: int = 6  #: largest number of frames that a film begins late
+    late: int = 6  #: largest number of frames that a video begins late
 
 
 def rays(K: np.ndarray, lens: Iterable[float], size: tuple[int, int], samples: int = 1) -> np.ndarray:
@@ -48,7 +48,7 @@ def board_pose(board: Board, time: float, at_rest: float, viewer: np.ndarray) ->
     """Returns board -> world [4, 4]: it swings above the origin, turned to ``viewer``, and rests from ``at_rest``."""
     moving = float(np.clip((at_rest - time) / 0.3, 0, 1))
     width = board.columns * board.square
-    # The pace changes, so that the motion of two films matches at one lag only.
+    # The pace changes, so that the motion of two videos matches at one lag only.
     phase = 11 * time + 0.9 * np.sin(7 * time) + 0.4 * np.sin(13 * time)
     turn = moving * np.array([0.5 * np.sin(phase), 0.6 * np.cos(0.7 * phase), 0.6 * np.sin(0.4 * phase)])
     across = np.hypot(*viewer[:2])
@@ -60,7 +60,7 @@ def board_pose(board: Board, time: float, at_rest: float, viewer: np.ndarray) ->
     return pose @ middle
 
 
-def board_film(board: Board, K, viewmat: np.ndarray, lens, size, times, at_rest: float, viewer, seed: int):
+def board_clip(board: Board, K, viewmat: np.ndarray, lens, size, times, at_rest: float, viewer, seed: int):
     """Yields frames [h, w, 3] of the board at ``times``, turned to ``viewer``; pixel centres of ``K`` are integers."""
     print_size = board.columns * PIXELS, board.rows * PIXELS
     paper = np.pad(board.made().generateImage(print_size), round(MARGIN * PIXELS), constant_values=255)
@@ -87,8 +87,8 @@ def degraded(frames: Iterable[np.ndarray], damage: Damage, exposure: np.ndarray,
         yield before.round().clip(0, 255).astype(np.uint8)
 
 
-def write_films(data: Path, out: Path, cams: list[int], damage: Damage = Damage(), seed: int = 0) -> dict:
-    """Writes one take for each scene in ``data``, films of the board, and truth.json, whose content it returns."""
+def write_clips(data: Path, out: Path, cams: list[int], damage: Damage = Damage(), seed: int = 0) -> dict:
+    """Writes one take for each scene in ``data``, videos of the board, and truth.json, whose content it returns."""
     rng = np.random.default_rng(seed)
     scenes = [Scene.open(folder) for folder in find_scenes(data)]
     first = scenes[0]
@@ -99,20 +99,20 @@ def write_films(data: Path, out: Path, cams: list[int], damage: Damage = Damage(
     truth = {"starts": {}}
     for cam in cams:
         truth[f"cam_{cam}"] = {"K": Ks[cam].tolist(), "viewmat": viewmats[cam].tolist(), "lens": list(damage.lens)}
-    films = {f"{scene.path.parent.name}_{scene.path.name}": scene for scene in scenes}
-    for take in ("board", *films):
+    clips = {f"{scene.path.parent.name}_{scene.path.name}": scene for scene in scenes}
+    for take in ("board", *clips):
         (out / take).mkdir(parents=True, exist_ok=True)
         starts = rng.integers(0, damage.late + 1, len(cams)).tolist()
         truth["starts"][take] = [start / first.fps for start in starts]
         for cam, start in zip(cams, starts, strict=True):
             if take == "board":
                 times = (start + np.arange(round(SECONDS * first.fps))) / first.fps
-                frames = board_film(
+                frames = board_clip(
                     BOARD, Ks[cam], viewmats[cam], damage.lens, size, times, SECONDS - AT_REST, viewer, cam
                 )
             else:
                 at = (rays(Ks[cam], damage.lens, size) @ Ks[cam].T)[..., :2].astype(np.float32)
-                images = films[take].images([cam], range(start, films[take].n_steps))[:, 0].permute(0, 2, 3, 1).numpy()
+                images = clips[take].images([cam], range(start, clips[take].n_steps))[:, 0].permute(0, 2, 3, 1).numpy()
                 frames = (cv2.remap(image, at, None, cv2.INTER_LINEAR) for image in images)
             write_video(out / take / f"cam_{cam}.mp4", degraded(frames, damage, exposures[cam], rng), first.fps)
     (out / "truth.json").write_text(json.dumps(truth, indent=1))
@@ -126,8 +126,8 @@ def main() -> None:
     parser.add_argument("--cameras", type=int, nargs="+", default=[0, 1, 2], metavar="CAM")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    write_films(args.data, args.out, args.cameras, seed=args.seed)
-    print(f"films in {args.out}: --board {BOARD.columns} {BOARD.rows} {BOARD.square}")
+    write_clips(args.data, args.out, args.cameras, seed=args.seed)
+    print(f"videos in {args.out}: --board {BOARD.columns} {BOARD.rows} {BOARD.square}")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Films: labels, times and sizes of their panels."""
+"""Videos: labels, times and sizes of their panels."""
 
 import re
 
@@ -9,7 +9,7 @@ import pytest
 from gsim3d.cli.main import main
 from gsim3d.data import Scene
 from gsim3d.io.formats import write_splats
-from gsim3d.viewer.films import ACCENT, film_frames
+from gsim3d.viewer.clips import ACCENT, clip_frames
 from tests.tiny_scenes import write_scene
 from tests.viewer.test_player import make, unpacked
 
@@ -29,19 +29,19 @@ def has_text(corner, color):
     [((64, 64), (512, 512)), ((101, 180), (512, 912)), ((700, 901), (700, 900)), ((60, 400), (144, 956))],
     ids=["small", "odd", "large", "wide"],
 )
-def test_film_panels_have_sizes_that_screens_like(size, panel):
+def test_clip_panels_have_sizes_that_screens_like(size, panel):
     n_views = 4 if size == (60, 400) else 2
     rows = {"truth": flat(1, n_views, *size, 90), "predicted": flat(1, n_views, *size, 20)}
-    (frame,) = film_frames(rows, 24)
+    (frame,) = clip_frames(rows, 24)
     height, width = panel
     assert frame.shape == (2 * height + 4, n_views * (width + 4) - 4, 3) and frame.shape[1] <= 3840
     assert frame.shape[0] % 2 == frame.shape[1] % 2 == 0
     assert (frame[height // 2, :width] == 90).all() and (frame[height + 4 + height // 2, :width] == 20).all()
 
 
-def test_film_panels_have_labels_and_time():
+def test_clip_panels_have_labels_and_time():
     rows = {"truth": flat(3, 2, 64, 64, 90), "predicted": flat(3, 2, 64, 64, 20)}
-    frames = list(film_frames(rows, 2.0, n_given=1))
+    frames = list(clip_frames(rows, 2.0, n_given=1))
     labels = [frame[516:560, :220] for frame in frames]
     for frame in frames:
         assert has_text(frame[:44, :220], 255) and has_text(frame[:44, -220:], 255)

@@ -1,4 +1,4 @@
-"""The films of a capture: takes, frames, and the times of several films relative to each other."""
+"""The videos of a capture: takes, frames, and the times of several videos relative to each other."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from gsim3d.data.videos import VIDEO_SUFFIXES
 from gsim3d.errors import InputError
 from gsim3d.io.terminal import progress
 
-BOARD = "board"  # folder with films of the board
+BOARD = "board"  # folder with videos of the board
 MOTION_WIDTH = 160  # pixels, of the images in which motion is measured
-MAX_LAG = 10.0  # seconds; films that start further apart cannot be aligned
-MIN_OVERLAP = 0.5  # of the shorter film, at any tested lag
-MIN_AGREEMENT = 0.5  # correlation of the motion in two films
+MAX_LAG = 10.0  # seconds; videos that start further apart cannot be aligned
+MIN_OVERLAP = 0.5  # of the shorter video, at any tested lag
+MIN_AGREEMENT = 0.5  # correlation of the motion in two videos
 CHANCE = 1.0  # standard deviations; less agreement without offsets counts as this
-MARGIN = 2.5  # standard deviations a film; synchronous ones at most 60 degrees apart reach 2.3, late ones from 2.9
-MIN_VARIATION = 0.1  # of the motion, over its mean; films that show less are not aligned
+MARGIN = 2.5  # standard deviations a video; synchronous ones at most 60 degrees apart reach 2.3, late ones from 2.9
+MIN_VARIATION = 0.1  # of the motion, over its mean; videos that show less are not aligned
 MIN_FRAMES = 16
 REPEATED = 0.1  # of the median motion; frames that change less repeat the one before
 GRID = 4  # samples of the motion a frame
@@ -32,16 +32,16 @@ APART = 3 * GRID  # samples between independent ones
 
 
 @dataclass(frozen=True)
-class Film:
-    """One film of a take."""
+class Clip:
+    """One video of a take."""
 
     name: str  #: camera, the name of the file without its ending
     size: tuple[int, int]  #: (width, height) in pixels
     video: Video  #: its frames and their times
 
     @classmethod
-    def open(cls, file: Path) -> Film:
-        """Opens a film; raises InputError if it cannot be decoded, or is a single picture."""
+    def open(cls, file: Path) -> Clip:
+        """Opens a video; raises InputError if it cannot be decoded, or is a single picture."""
         capture = open_video(file, f"{file} ")
         size = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
         capture.release()
@@ -75,55 +75,55 @@ class Film:
 
 
 def takes_of(folder: Path) -> dict[Path, list[Path]]:
-    """Returns the films of each take: those in ``folder``, or else those of each of its subfolders.
+    """Returns the videos of each take: those in ``folder``, or else those of each of its subfolders.
 
     Raises:
-        InputError: there is no take of two films or more, or the takes have different cameras.
+        InputError: there is no take of two videos or more, or the takes have different cameras.
     """
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder")
     below = [path for path in sorted(folder.iterdir()) if path.is_dir() and path.name[0] != "." and path.name != BOARD]
-    own = films_in(folder)
-    takes = {folder: own} if own else {take: films for take in below if (films := films_in(take))}
-    for take, films in takes.items():
-        names, first = [film.stem for film in films], [film.stem for film in next(iter(takes.values()))]
+    own = clips_in(folder)
+    takes = {folder: own} if own else {take: clips for take in below if (clips := clips_in(take))}
+    for take, clips in takes.items():
+        names, first = [clip.stem for clip in clips], [clip.stem for clip in next(iter(takes.values()))]
         if len(names) < 2 or names != first:
             raise InputError(
-                f"{take}: has films of {', '.join(names)}; every take needs one film of the same two cameras or more "
+                f"{take}: has videos of {', '.join(names)}; every take needs one video of the same two cameras or more "
                 f"({', '.join(first)})"
             )
     if not takes:
-        raise InputError(f"{folder}: no films (<camera>{'|'.join(VIDEO_SUFFIXES)}) in it or in its subfolders")
+        raise InputError(f"{folder}: no videos (<camera>{'|'.join(VIDEO_SUFFIXES)}) in it or in its subfolders")
     return takes
 
 
-def films_in(folder: Path) -> list[Path]:
-    """Returns the film files in ``folder``, in natural order. Raises InputError if two are of one camera."""
+def clips_in(folder: Path) -> list[Path]:
+    """Returns the video files in ``folder``, in natural order. Raises InputError if two are of one camera."""
     files = filter(Path.is_file, folder.iterdir()) if folder.is_dir() else ()
-    films = [file for file in files if file.suffix.lower() in VIDEO_SUFFIXES and file.name[0] != "."]
-    films.sort(key=lambda file: natural_order(file.name))
-    for film, other in itertools.combinations(films, 2):
-        if film.stem == other.stem:
-            raise InputError(f"{folder}: has two films of camera {film.stem}: {film.name} and {other.name}; remove one")
-    return films
+    clips = [file for file in files if file.suffix.lower() in VIDEO_SUFFIXES and file.name[0] != "."]
+    clips.sort(key=lambda file: natural_order(file.name))
+    for clip, other in itertools.combinations(clips, 2):
+        if clip.stem == other.stem:
+            raise InputError(f"{folder}: two videos of camera {clip.stem}: {clip.name} and {other.name}; remove one")
+    return clips
 
 
 def time_offsets(times: Sequence[np.ndarray], motions: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Aligns films by the motion that they show.
+    """Aligns videos by the motion that they show.
 
-    The lag of two films is the peak of the normalised cross-correlation of the relative change of their motion, which
+    The lag of two videos is the peak of the normalised cross-correlation of the relative change of their motion, which
     depends less on the view than motion itself, by its significance (Fisher's z): a few frames that happen to agree
     count less than many. Offsets follow from the pairs whose peaks are most significant. All are 0 unless they make the
-    films agree clearly better: views of one motion differ, so that synchronous films, too, have their peaks elsewhere.
+    videos agree clearly better: views of one motion differ, so that synchronous videos have peaks elsewhere, too.
 
     Args:
-        times: seconds of the frames of each of V films.
-        motions: :attr:`Film.motion` of each film.
+        times: seconds of the frames of each of V videos.
+        motions: :attr:`Clip.motion` of each video.
 
     Returns:
-        Offsets [V] in seconds to add to the times of each film, that of the first is 0; and the best correlation [V]
-        of each film with another at these offsets. Films that correlate by less than MIN_AGREEMENT with all others have
-        offset 0.
+        Offsets [V] in seconds to add to the times of each video, that of the first is 0; and the best correlation [V]
+        of each video with another at these offsets. Those that correlate by less than MIN_AGREEMENT with all others
+        have offset 0.
     """
     n = len(times)
     step = min(float(np.median(np.diff(own))) for own in times) / GRID
