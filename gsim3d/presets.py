@@ -84,15 +84,16 @@ def paper_latent(n_steps: int = 4, latents: int = 32) -> ModelConfig:
     return ModelConfig(encoder, dynamics, RendererConfig(latents=2 * latents))
 
 
-def paper_explicit(n_steps: int = 4) -> ModelConfig:
+def paper_explicit(n_steps: int = 4, static_latents: int = 16) -> ModelConfig:
     """The explicit model of the paper, which predicts all Gaussian parameters.
 
     Args:
         n_steps: history, 1, 2, 4 or 8.
+        static_latents: number of static latents; 16 in the paper, 0 in the published settings.
     """
     scales = {"scale_min": 0.004, "scale_max": 0.14}
-    sizes = {"static_latents": 16, "max_step": 0.05, "history_bits": _bits(n_steps)}
-    encoder = EncoderConfig(dynamic_dim=0, static_dim=16, explicit=True)
+    sizes = {"static_latents": static_latents, "max_step": 0.05, "history_bits": _bits(n_steps)}
+    encoder = EncoderConfig(dynamic_dim=0, static_dim=static_latents, explicit=True)
     dynamics = DynamicsConfig(dynamic_latents=0, explicit=True, **sizes, **scales)
     return ModelConfig(encoder, dynamics, RendererConfig(latents=0, **scales))
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsim3d.evaluate.report import markdown, summarize, table
+from gsim3d.evaluate.report import markdown, notes, summarize, table
 from gsim3d.evaluate.scoring import SceneScores, SceneTruth, ring_around_bodies
 
 GIVEN, S, H, W = 2, 5, 12, 20
@@ -101,7 +101,9 @@ def test_unknown_parts_are_not_reported():
     assert bare.body_share is None and list(bare.values) == ["constant"]
     assert "body_share" not in summary and "minus given steps" not in table(summary)
     mixed = summarize([scored(), bare])  # the second scene has no labels
-    assert mixed["methods"] == ["constant"] and "psnr_masked" in mixed["not_measured"] and "body_share" in mixed
+    assert "psnr_masked" in mixed["not_measured"] and "body_share" in mixed
+    assert mixed["n_scenes_of"] == {name: 1 for name in mixed["methods"] if name != "constant"}
+    assert "copy: mean over 1 of 2 scenes" in notes(mixed)
 
 
 def test_bodies_alone_have_no_ground():
