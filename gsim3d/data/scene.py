@@ -242,6 +242,7 @@ class Scene:
             cams = sorted(allowed[k * len(allowed) // n] for k in range(n))
         check_rate(self, inputs.fps)
         frames = make_frames([self], [list(cams)], [range(start, start + inputs.history)])
+        # What Restored.open_scene has opened enlarges images; its depths are fitted, or kept on request.
         as_recorded = self.fitting.near_far is None and not self.fitting.enlarge
         if not (inputs.near_far and as_recorded and similar((self.near, self.far), inputs.near_far)):
             return frames

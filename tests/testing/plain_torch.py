@@ -7,6 +7,7 @@ from torch import Tensor
 
 from gsim3d import ops
 from gsim3d.cameras import Cameras
+from gsim3d.testing import selftest
 
 TOLERANCE = 1e-4  # float32, relative to the largest value of the expected tensor
 
@@ -358,18 +359,4 @@ def _validate_state(device: str) -> float:
     return float(((record[:, 10] - opacity) / opacity).abs().max())
 
 
-CHECKS: dict[str, Callable[[str], float]] = {
-    "curve": _curve,
-    "sparse_conv": _sparse_conv,
-    "patch_attn": _patch_attn,
-    "pool": _pool,
-    "row_norm": _row_norm,
-    "plane_sweep": _plane_sweep,
-    "decode": _decode,
-    "background": _background,
-    "springs": _springs,
-    "validate_state": _validate_state,
-    "raster": _raster,
-    "projection": _projection,
-    "raster_projected": _raster_projected,
-}
+CHECKS: dict[str, Callable[[str], float]] = {name: globals()[f"_{name}"] for name in selftest.CHECKS}
