@@ -50,8 +50,9 @@ def check_floating(op: str, narrow: dict[str, Tensor | None] | None = None, **fi
                 raise ValueError(f"{op}: {other} must be {wanted}, as {name}, or of 16 bits; got {x.dtype}")
 
 
-def check_splits(op: str, n: int, **offsets: Tensor | None) -> None:
-    """Raises ValueError, naming the argument, unless offsets are int64 and, on the CPU, ascend from 0 to ``n``."""
+def check_splits(op: str, n: int, *, to_end: bool = True, **offsets: Tensor | None) -> None:
+    """Raises ValueError, naming the argument, unless offsets are int64 and, on the CPU, ascend from 0 to ``n``, or at
+    most to it."""
     for name, cu in offsets.items():
         if cu is None:
             continue
@@ -59,8 +60,9 @@ def check_splits(op: str, n: int, **offsets: Tensor | None) -> None:
             raise ValueError(f"{op}: {name} must be an int64 list of offsets; got {cu.dtype} {list(cu.shape)}")
         if cu.device.type == "cpu" and not torch.compiler.is_compiling():
             ends = cu.tolist()
-            if ends[0] != 0 or ends[-1] != n or ends != sorted(ends):
-                raise ValueError(f"{op}: {name} must ascend from 0 to {n}; got {ends[0]} .. {ends[-1]}")
+            if ends[0] != 0 or ends[-1] > n or (to_end and ends[-1] < n) or ends != sorted(ends):
+                last = n if to_end else f"at most {n}"
+                raise ValueError(f"{op}: {name} must ascend from 0 to {last}; got {ends[0]} .. {ends[-1]}")
 
 
 def check_numbers(op: str, *, largest_of: float = math.inf, negative: bool = True, **tensors: Tensor | None) -> None:
@@ -69,10 +71,10 @@ def check_numbers(op: str, *, largest_of: float = math.inf, negative: bool = Tru
     if torch.compiler.is_compiling():
         return
     for name, value in tensors.items():
+        while value is not None and torch._C._functorch.is_functorch_wrapped_tensor(value):
+            value = torch._C._functorch.get_unwrapped(value)  # all entries of a batch are looked at
         if value is None or value.device.type != "cpu" or value.dtype not in LARGEST or value.numel() == 0:
             continue
-        while torch._C._functorch.is_functorch_wrapped_tensor(value):  # all entries of a batch are looked at
-            value = torch._C._functorch.get_unwrapped(value)
         largest = min(LARGEST[value.dtype], largest_of)
         least = -largest if negative else 0.0
         low, high = (x.item() for x in torch.aminmax(value.detach()))

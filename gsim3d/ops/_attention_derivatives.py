@@ -31,7 +31,9 @@ class Patches:
 
     def of_queries(self, x: Tensor) -> Tensor:
         """[P, H, Lq, D] of x [Nq, H, D]; 0 where a patch is shorter."""
-        return _take(x, self.queries, self.has_query)
+        if self.queries.numel() == 0:
+            return x.new_zeros(*self.queries.shape, *x.shape[1:]).transpose(1, 2)
+        return torch.where(self.has_query[..., None, None], x[self.queries], 0).transpose(1, 2)
 
     def of_keys(self, x: Tensor) -> Tensor:
         """[P, H, Lk, D] of x [Nk, H, D]; 0 where a patch is shorter."""
@@ -64,31 +66,20 @@ def _padded(rows: Tensor, cu: Tensor, n: int) -> tuple[Tensor, Tensor]:
     return (rows[at] if rows.shape[0] else at), has_row
 
 
-def _take(x: Tensor, rows: Tensor, has_row: Tensor) -> Tensor:
-    if rows.numel() == 0:
-        return x.new_zeros(*rows.shape, *x.shape[1:]).transpose(1, 2)
-    return torch.where(has_row[..., None, None], x[rows], 0).transpose(1, 2)
-
-
 def _flat(x: Tensor) -> Tensor:
     return x.reshape(x.shape[0], x.shape[1] * x.shape[2])
 
 
 def tangent(q, k, v, by_q, by_k, by_v, lists, scale: float) -> Tensor:
-    """O' [Nq, H, D] along a direction (by_q, by_k, by_v), of which some may be None."""
+    """O' [Nq, H, D] along a direction (by_q, by_k, by_v)."""
     dtype = q.dtype
-    q, k, v, by_q, by_k, by_v = (x if x is None else widened(x) for x in (q, k, v, by_q, by_k, by_v))
+    q, k, v, by_q, by_k, by_v = map(widened, (q, k, v, by_q, by_k, by_v))
     patches = Patches(lists, q.shape[0], k.shape[0])
-    q, k, v = patches.of_queries(q), patches.of_keys(k), patches.of_keys(v)
+    q, by_q = map(patches.of_queries, (q, by_q))
+    k, v, by_k, by_v = map(patches.of_keys, (k, v, by_k, by_v))
     weights = patches.softmax(scale * q @ k.mT)
-    moved = torch.zeros_like(weights)
-    if by_q is not None:
-        moved = moved + scale * patches.of_queries(by_q) @ k.mT
-    if by_k is not None:
-        moved = moved + scale * q @ patches.of_keys(by_k).mT
-    out = (weights * (moved - (weights * moved).sum(-1, keepdim=True))) @ v
-    if by_v is not None:
-        out = out + weights @ patches.of_keys(by_v)
+    moved = scale * (by_q @ k.mT + q @ by_k.mT)
+    out = (weights * (moved - (weights * moved).sum(-1, keepdim=True))) @ v + weights @ by_v
     return patches.to_queries(out).to(dtype)
 
 

@@ -61,7 +61,7 @@ def register_gradients(
         without: tensor arguments that have no gradient.
         jvp: (inputs, their tangents or None, outputs) -> tangents of the outputs; :func:`call` then has forward mode.
         batched: (size, inputs, is_batched) -> outputs with the batch in front, of inputs that have it in front where
-            ``is_batched``; :func:`call` then has ``torch.func``.
+            ``is_batched``; with ``jvp``, :func:`call` then has ``torch.func``.
     """
     backward = _without_autocast(backward)
     _register(op, op, backward, setup, without)
@@ -112,19 +112,24 @@ def _function_of(op: str, backward: Callable, setup: Callable, jvp: Callable | N
 
         @staticmethod
         def jvp(ctx, *tangents):
-            if jvp is None:
-                said = "no derivative in forward mode (jvp of a gradient); use reverse mode over reverse mode, as"
-                raise GradientError(f"{op}: its gradient has {said} torch.func.jacrev", op=op, argument=None, order=2)
-            tensors, others = iter(ctx.saved_tensors), iter(ctx.others)
-            inputs = [next(tensors if is_tensor else others) for is_tensor in ctx.is_tensor]
-            return jvp(inputs, tangents, tuple(tensors))
+            # Of a jvp around this one the tangents count as well: torch leaves them out in here.
+            with forward_ad._set_fwd_grad_enabled(True):
+                tensors = (forward_ad.unpack_dual(x, level=0).primal for x in ctx.saved_tensors)
+                others = iter(ctx.others)
+                inputs = [next(tensors if is_tensor else others) for is_tensor in ctx.is_tensor]
+                return jvp(inputs, tangents, tuple(tensors))
 
         @staticmethod
         def vmap(info, in_dims, *inputs):
             pairs = list(zip(inputs, in_dims, strict=True))
             moved = [x if dim is None else x.movedim(dim, 0) for x, dim in pairs]
-            outputs = batched(info.batch_size, moved, [dim is not None for dim in in_dims])
-            return outputs, (0,) * len(outputs) if isinstance(outputs, tuple) else 0
+            size, has = info.batch_size, [dim is not None for dim in in_dims]
+            if size == 0:  # the shapes of results are those of an entry
+                moved = [x.new_zeros(1, *x.shape[1:]) if is_batched else x for x, is_batched in zip(moved, has)]
+            outputs = batched(size or 1, moved, has)
+            if isinstance(outputs, tuple):
+                return tuple(x[:size] for x in outputs), (0,) * len(outputs)
+            return outputs[:size], 0
 
     Function.backward = staticmethod(backward)
     Function.__name__ = Function.__qualname__ = op

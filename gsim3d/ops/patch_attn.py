@@ -175,7 +175,11 @@ def _backward(ctx, grad, _grad_stats):
 
 
 def _jvp(inputs, tangents, outputs):
-    return tangent(*inputs[:3], *tangents[:3], inputs[3:7], inputs[7]), None
+    return tangent(*inputs[:3], *_along(inputs[:3], tangents), inputs[3:7], inputs[7]), None
+
+
+def _along(tensors, tangents):
+    return [torch.zeros_like(x) if t is None else t for x, t in zip(tensors, tangents)]
 
 
 def _gradient_setup(ctx, inputs, output):
@@ -186,6 +190,13 @@ def _gradient_setup(ctx, inputs, output):
 def _gradient_backward(ctx, by_q, by_k, by_v):
     grad, q, k, v, *lists = ctx.saved_tensors
     return *gradients_of_gradients(grad, q, k, v, by_q, by_k, by_v, lists, ctx.scale), *(None,) * 7
+
+
+def _gradient_jvp(inputs, tangents, outputs):
+    # Second derivatives are symmetric: along a direction of q, k, v they are those of the gradient's product with it.
+    by_grad, *along = _along(inputs[:4], tangents)
+    curved = gradients_of_gradients(*inputs[:4], *along, inputs[6:-1], inputs[-1])[1:]
+    return tuple(a + b for a, b in zip(call(_gradient, by_grad, *inputs[1:]), curved, strict=True))
 
 
 def _batched(op: str, n_floats: int):
@@ -228,13 +239,9 @@ def _lse_backward(ctx, grad):
 
 
 def _lse_jvp(inputs, tangents, outputs):
-    (_, q, k, *lists, scale), (_, by_q, by_k, *_) = inputs, tangents
-    total = torch.zeros_like(outputs[0])
-    if by_q is not None:
-        total = total + scale * (by_q * call("patch_attention", q, k, k, *lists, scale)[0]).sum(-1)
-    if by_k is not None:
-        total = total + scale * (q * call("patch_attention", q, k, by_k, *lists, scale)[0]).sum(-1)
-    return total
+    (_, q, k, *lists, scale), (_, by_q, by_k) = inputs, _along(inputs[:3], tangents)
+    mean, moved = (call("patch_attention", q, k, x, *lists, scale)[0] for x in (k, by_k))
+    return scale * (by_q * mean + q * moved).sum(-1, dtype=outputs[0].dtype)
 
 
 def _joint_setup(ctx, inputs, output):
@@ -257,7 +264,7 @@ def _joint_backward(ctx, grad, _grad_stats):
 _op, _gradient, _lse = "patch_attention", "patch_attention_backward", "attention_log_sum_exp"
 _packed = [f"{_gradient}_packed"]
 register_gradients(_op, _backward, _setup, gradient_ops=_packed, jvp=_jvp, batched=_batched(_op, 3))
-register_gradients(_gradient, _gradient_backward, _gradient_setup, batched=_batched(_gradient, 6))
+register_gradients(_gradient, _gradient_backward, _gradient_setup, jvp=_gradient_jvp, batched=_batched(_gradient, 6))
 register_gradients(_lse, _lse_backward, _lse_setup, jvp=_lse_jvp, batched=one_by_one(_lse))
 register_gradients("joint_attention", _joint_backward, _joint_setup, gradient_ops=["joint_attention_backward"])
 register_autocast(_op, "follow")

@@ -144,15 +144,15 @@ def _pool_max_jvp(inputs, tangents, outputs):
     return None if tangents[0] is None else _at_maxima(tangents[0], outputs[1]), None
 
 
-def _pool_max_gradient_setup(ctx, inputs, output):
+def _of_max_setup(ctx, inputs, output):
     ctx.save_for_backward(inputs[1])
 
 
-def _pool_max_gradient_backward(ctx, grad):
+def _of_max_backward(ctx, grad):
     return _at_maxima(grad, ctx.saved_tensors[0]), None, None
 
 
-def _pool_max_gradient_batched(size, inputs, is_batched):
+def _of_max_batched(size, inputs, is_batched):
     (grad, argmax), n_rows = expanded(size, inputs[:2], is_batched[:2]), inputs[2]
     first = n_rows * torch.arange(size, device=argmax.device)[:, None, None]
     argmax = torch.where(argmax < 0, argmax, argmax + first)
@@ -204,13 +204,8 @@ def _to_segments(op: str):
 
 _batched = _batched_lists("pool_max", False, True)
 register_gradients("pool_max", _pool_max_backward, _pool_max_setup, jvp=_pool_max_jvp, batched=_batched)
-register_gradients(
-    "pool_max_backward",
-    _pool_max_gradient_backward,
-    _pool_max_gradient_setup,
-    jvp=_linear_jvp("pool_max_backward"),
-    batched=_pool_max_gradient_batched,
-)
+_of_max = "pool_max_backward"
+register_gradients(_of_max, _of_max_backward, _of_max_setup, jvp=_linear_jvp(_of_max), batched=_of_max_batched)
 for _op, _backward, _has_segments in (
     ("pool_mean", _to_rows("pool_mean_backward"), False),
     ("pool_mean_backward", _to_segments("pool_mean"), True),

@@ -320,12 +320,9 @@ def _gradients(grad_color, grad_alpha, grad_depth, grad_features, transmittance,
     return tuple(inputs[0].new_empty(shape) for shape in shapes)
 
 
-def _tangents(*inputs):
-    return tuple(x.new_empty(x.shape) for x in (*inputs[19:23], *inputs[:8]))
-
-
 TANGENT = "rasterize_gaussians_backward_tangent"  # of images and of gradients, along a direction
-fakes(**{OP: _images, f"{OP}_backward": _gradients, TANGENT: _tangents})
+fakes(**{OP: _images, f"{OP}_backward": _gradients})
+fakes(**{TANGENT: lambda *inputs: tuple(x.new_empty(x.shape) for x in (*inputs[19:23], *inputs[:8]))})
 
 
 def _setup(ctx, inputs, output):
@@ -355,14 +352,9 @@ def _folded(size: int, scene: Sequence[Tensor], is_batched: Sequence[bool], opti
     return rows, [*options[:5], *sizes_of_state(rows[0], size * viewmats.shape[1], size * n_clouds, width, height)]
 
 
-def _folded_masks(size: int, active: Sequence[Tensor | None], is_batched: Sequence[bool]) -> list[Tensor | None]:
-    """The last argument, if it is given, for the images of all scenes."""
-    return [x if x is None else x.flatten(0, 1) for x in expanded(size, active, is_batched)]
-
-
 def _batched(size, inputs, is_batched):
     rows, options = _folded(size, inputs[:11], is_batched[:11], inputs[11:])
-    active = _folded_masks(size, inputs[20:], is_batched[20:])
+    active = [x if x is None else x.flatten(0, 1) for x in expanded(size, inputs[20:], is_batched[20:])]
     *images, state, unusable = call(OP, *rows, *options, inputs[19], *active)
     images = [x.unflatten(0, (size, -1)) for x in images]
     return (*images, state.expand(size, -1), unusable.reshape(size, -1, 2))  # the state is of all of them
@@ -373,7 +365,7 @@ def _backward_batched(size, inputs, is_batched):
         return one_by_one(f"{OP}_backward")(size, inputs, is_batched)
     of_images = [x.flatten(0, 1) for x in expanded(size, inputs[:6], is_batched[:6])]
     rows, options = _folded(size, inputs[7:18], is_batched[7:18], inputs[18:])
-    active = _folded_masks(size, inputs[27:], is_batched[27:])
+    active = [x if x is None else x.flatten(0, 1) for x in expanded(size, inputs[27:], is_batched[27:])]
     grads = call(f"{OP}_backward", *of_images, inputs[6][0], *rows, *options, inputs[26], *active)
     return tuple(x.reshape(size, x.shape[0] // size, *x.shape[1:]) for x in grads)
 
@@ -412,11 +404,11 @@ def _second_jvp(inputs, tangents, outputs):
 
 
 def _third(ctx, *_):
-    said = "has no third derivative (order 3); detach the second"
+    said = "has no third derivative (order 3) and none of forward mode; detach the second, or use torch.func.hessian"
     raise GradientError(f"{OP}: the rasterizer {said}", op=OP, argument=None, order=3)
 
 
 register_gradients(OP, _backward, _setup, without=["Ks"], jvp=_jvp, batched=_batched)
 register_gradients(f"{OP}_backward", _second_backward, _second_setup, jvp=_second_jvp, batched=_backward_batched)
-register_gradients(TANGENT, _third, lambda ctx, inputs, output: None, batched=one_by_one(TANGENT))
+register_gradients(TANGENT, _third, lambda ctx, inputs, output: None, jvp=_third, batched=one_by_one(TANGENT))
 register_autocast(OP, "float32")

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from gsim3d.ops._arguments import as_given, check_numbers, check_tensors, widened
+from gsim3d.ops._arguments import as_given, check_numbers, check_splits, check_tensors, widened
 from gsim3d.ops._register import call
 from gsim3d.ops.pool import pool_max
 
@@ -99,14 +99,7 @@ def _rows(x: Tensor) -> Tensor:
 
 def _check(op: str, x: Tensor, cu_rows: Tensor) -> None:
     check_tensors(op, x=x, cu_rows=cu_rows)
-    if torch.compiler.is_compiling():
-        return
     if x.dim() != 2 or not x.is_floating_point():
         raise ValueError(f"{op}: x must be [N, C], floating point; got {list(x.shape)} {x.dtype}")
-    if cu_rows.dim() != 1 or cu_rows.shape[0] == 0 or cu_rows.dtype != torch.int64:
-        raise ValueError(f"{op}: cu_rows must be int64 [M + 1]; got {list(cu_rows.shape)} {cu_rows.dtype}")
-    if cu_rows.device.type == "cpu":
-        first, last, n = int(cu_rows[0]), int(cu_rows[-1]), x.shape[0]
-        if first != 0 or last > n or bool((cu_rows.diff() < 0).any()):
-            raise ValueError(f"{op}: cu_rows must ascend from 0 to at most N={n}; got {first} .. {last}")
+    check_splits(op, x.shape[0], to_end=False, cu_rows=cu_rows)
     check_numbers(op, x=x)

@@ -164,12 +164,12 @@ def _backward(ctx, grad):
 # The convolution is linear in features and in weights, so its gradients are, and their gradients are convolutions.
 
 
-def _grad_input_setup(ctx, inputs, output):
+def _input_setup(ctx, inputs, output):
     grad, weight, *geometry, ctx.first, plan = inputs
     ctx.save_for_backward(grad, weight, plan, *geometry)
 
 
-def _grad_input_backward(ctx, by_x):
+def _input_backward(ctx, by_x):
     grad, weight, plan, *geometry = ctx.saved_tensors
     by_grad = by_weight = None
     if ctx.needs_input_grad[0]:
@@ -179,12 +179,12 @@ def _grad_input_backward(ctx, by_x):
     return by_grad, by_weight, *[None] * 8
 
 
-def _grad_weight_setup(ctx, inputs, output):
+def _weight_setup(ctx, inputs, output):
     grad, x, _, *geometry, ctx.first, _ = inputs
     ctx.save_for_backward(grad, x, *geometry)
 
 
-def _grad_weight_backward(ctx, by_weight, by_bias):
+def _weight_backward(ctx, by_weight, by_bias):
     grad, x, *geometry = ctx.saved_tensors
     by_weight, by_bias = by_weight.to(x.dtype), by_bias.to(x.dtype)
     by_grad = by_x = None
@@ -196,13 +196,26 @@ def _grad_weight_backward(ctx, by_weight, by_bias):
 
 
 def _jvp(inputs, tangents, outputs):
-    (x, weight, _, *rest), (by_x, by_weight, by_bias, *_) = inputs, tangents
-    tangent = torch.zeros_like(outputs[0])
-    if by_x is not None:
-        tangent = tangent + call("sparse_conv", by_x, weight, None, *rest)
-    if by_weight is not None:
-        tangent = tangent + call("sparse_conv", x, by_weight, None, *rest)
-    return tangent if by_bias is None else tangent + by_bias
+    terms = [*_along("sparse_conv", (*inputs[:2], None, *inputs[3:]), tangents), tangents[2]]
+    return sum((x for x in terms if x is not None), torch.zeros_like(outputs[0]))
+
+
+def _along(op, inputs, tangents):
+    """What an op that is linear in each of its first two inputs adds along the tangent of either, or None."""
+    a, b, *rest = inputs
+    directions = ((tangents[0], b), (a, tangents[1]))
+    return [None if x is None or y is None else call(op, x, y, *rest) for x, y in directions]
+
+
+def _input_jvp(inputs, tangents, outputs):
+    return sum(x for x in _along(_of_input, inputs, tangents) if x is not None)
+
+
+def _weight_jvp(inputs, tangents, outputs):
+    by_grad, by_x = _along(_of_weight, inputs, tangents)
+    zeros = [torch.zeros_like(x) for x in outputs]
+    (weight, bias), (more, _) = by_grad or zeros, by_x or zeros
+    return weight + more, bias
 
 
 def _batched(op: str, n_floats: int):
@@ -232,6 +245,6 @@ def _beside(size, row_voxel, voxel_rows, cu_voxel_rows, tap_in, tap_out, cu_taps
 
 _of_input, _of_weight = "sparse_conv_grad_input", "sparse_conv_grad_weight"
 register_gradients("sparse_conv", _backward, _setup, jvp=_jvp, batched=_batched("sparse_conv", 3))
-register_gradients(_of_input, _grad_input_backward, _grad_input_setup, batched=_batched(_of_input, 2))
-register_gradients(_of_weight, _grad_weight_backward, _grad_weight_setup, batched=one_by_one(_of_weight))
+register_gradients(_of_input, _input_backward, _input_setup, jvp=_input_jvp, batched=_batched(_of_input, 2))
+register_gradients(_of_weight, _weight_backward, _weight_setup, jvp=_weight_jvp, batched=one_by_one(_of_weight))
 register_autocast("sparse_conv", "follow")

@@ -139,6 +139,16 @@ def test_what_is_not_there_is_refused_by_name(device):
         value = loss(leaf)
         for _ in range(2 if device.type == "cuda" else 3):
             value = torch.autograd.grad(value.sum(), leaf, create_graph=True)[0]
+    for outer in (torch.func.jacfwd, torch.func.jacrev):
+        with pytest.raises(GradientError, match="rasterize_gaussians"):
+            outer(torch.func.jacfwd(loss))(scene.means)
+
+
+def test_vmap_of_no_scenes(device):
+    scene, _ = small()
+    scene = scene.to(device)
+    none = scene.means[None][:0]
+    assert torch.vmap(lambda means: scene.render(means, *scene.inputs[1:])[1])(none).shape[0] == 0
 
 
 def test_gradients_of_Ks_are_refused_by_name():

@@ -87,9 +87,9 @@ def test_errors(op):
     for cu in ([1, 2], [0, 10], [0, 3, 2]):
         with pytest.raises(ValueError, match=f"{op}: cu_rows must ascend from 0"):
             OPS[op](rows(), torch.tensor(cu))
-    with pytest.raises(ValueError, match=f"{op}: cu_rows must be int64"):
+    with pytest.raises(ValueError, match=f"{op}: cu_rows must be an int64 list"):
         OPS[op](rows(), CU.int())
-    with pytest.raises(ValueError, match=f"{op}: cu_rows must be int64"):
+    with pytest.raises(ValueError, match=f"{op}: cu_rows must be an int64 list"):
         OPS[op](rows(), CU[:0])
     for x in (rows()[0], rows().long()):
         with pytest.raises(ValueError, match=f"{op}: x must be"):

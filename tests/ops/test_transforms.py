@@ -108,15 +108,27 @@ def test_vmap_equals_a_loop(op, device, of_all):
 
 
 @EVERY_OP
-def test_hessian_by_reverse_over_reverse(op, device):
+@pytest.mark.parametrize("outer", [torch.func.jacrev, torch.func.jacfwd])
+@pytest.mark.parametrize("inner", [torch.func.jacrev, torch.func.jacfwd])
+def test_hessian_by_any_two_modes(op, device, outer, inner):
     function, inputs = calls(device)[op]
 
-    def loss(x):
-        return function(x, *inputs[1:]).pow(2).sum()
+    def loss(steps):  # along one direction for each input, and one for all
+        return function(*(x + (s + steps[-1]) * torch.cos(9 * x) for x, s in zip(inputs, steps))).pow(3).sum()
 
-    ours = torch.func.jacrev(torch.func.jacrev(loss))(inputs[0])
-    expected = torch.autograd.functional.hessian(loss, inputs[0])
+    steps = torch.zeros(len(inputs) + 1, dtype=torch.float64, device=device)
+    ours, expected = outer(inner(loss))(steps), torch.autograd.functional.hessian(loss, steps)
+    assert expected.abs().min() > 0
     torch.testing.assert_close(ours, expected)
+
+
+@EVERY_OP
+def test_vmap_of_no_entries(op, device):
+    function, inputs = calls(device)[op]
+    none, shape = [x[None][:0] for x in inputs], function(*inputs).shape
+    assert torch.vmap(function)(*none).shape == (0, *shape)
+    gradient = torch.func.grad(lambda *xs: function(*xs).sum())
+    assert torch.vmap(gradient)(*none).shape == (0, *inputs[0].shape)
 
 
 @EVERY_OP
