@@ -130,7 +130,7 @@ def check_ranges(config: Any, **ranges: tuple[float, float]) -> None:
 
 
 def _numbers(value: Any) -> Iterator[float]:
-    if isinstance(value, tuple):
+    if isinstance(value, (tuple, list)):
         for item in value:
             yield from _numbers(item)
     elif value is not None:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gsim3d.cameras import Cameras
 from gsim3d.errors import InputError, check_one_of
-from gsim3d.ops._arguments import check_floating, check_numbers, check_tensors, check_whole, constant
+from gsim3d.ops._arguments import check_floating, check_numbers, check_real, check_tensors, check_whole, constant
 from gsim3d.ops.projection import Projection, project_gaussians, sh_to_color
 from gsim3d.ops.raster import LARGEST, Rendering
 from gsim3d.ops.raster_projected import rasterize_projected
@@ -95,7 +95,7 @@ def rasterization(
         opacities: [..., N] in [0, 1].
         colors: [..., N, D] or [..., C, N, D]; with ``sh_degree`` [N, K, D] or [..., N, K, D] coefficients; also
             float16. None where ``render_mode`` has no colour.
-        viewmats: [..., C, 4, 4] world to camera; like ``Ks`` cast to the dtype of ``means``.
+        viewmats: [..., C, 4, 4] world to camera; like ``Ks`` and coefficients cast to the dtype of ``means``.
         Ks: [..., C, 3, 3] pixels.
         width, height: pixels.
         near_plane, far_plane: metres of camera z.
@@ -143,17 +143,20 @@ def rasterization(
     optional |= {"radial_coeffs": radial_coeffs, "tangential_coeffs": tangential_coeffs}
     optional |= {"colors": colors, "backgrounds": backgrounds} if with_color else {}
     check_whole(OP, width=width, height=height)
+    check_real(OP, eps2d=eps2d)
+    if not 0 <= eps2d < math.inf:
+        raise ValueError(f"{OP}: eps2d must be finite and not negative; got {eps2d}")
     _check(camera_model, means, viewmats, Ks, opacities, optional)
     batch, n, n_cameras = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
     viewmats, Ks = viewmats.to(means.dtype), Ks.to(means.dtype)
     n_batches, n_images = math.prod(batch), math.prod((*batch, n_cameras))
     antialiased = rasterize_mode == "antialiased"
-
     lens, distortion = _lens(LENSES[camera_model], radial_coeffs, tangential_coeffs, n_images)
     unread = constant(torch.arange, n_images, device=means.device)  # planes and clouds
     cameras = Cameras(viewmats.flatten(0, -3), Ks.flatten(0, -3), unread, unread, unread, width, height)
     shapes = (None, None) if covars is not None else (quats.flatten(0, -2), scales.flatten(0, -2))
     limits = {"near_plane": near_plane, "far_plane": far_plane, "radius_clip": radius_clip, "dilation": eps2d}
+    distortion = None if distortion is None else distortion.to(means.dtype)
     options = {"lens": lens, "distortion": distortion, "jacobian": "clamped", "antialiased": antialiased, **limits}
     options["covars"] = None if covars is None else covars.flatten(0, -3)
     flat_opacities = opacities.flatten()
@@ -164,7 +167,7 @@ def rasterization(
     alphas = flat_opacities if n_cameras == 1 else opacities[..., None, :].expand(*batch, n_cameras, n).reshape(-1)
     alphas = alphas * projection.compensations if antialiased else alphas
     rows, cu_pairs = (*projection[:4], alphas, values), projection.cu_pairs
-    meta = Meta(batch_ids=None, camera_ids=None, gaussian_ids=None)
+    meta = Meta(batch_ids=None, camera_ids=None, gaussian_ids=None, tile_size=tile_size or 16)
     sizes = (*batch, n_cameras, n)
     if packed:
         rows, cu_pairs, ids = _seen(rows, projection, n, n_cameras)
@@ -174,7 +177,6 @@ def rasterization(
     known = {"radii": radii, "means2d": means2d, "depths": depths, "conics": conics, "opacities": alphas}
     meta |= {name: row.reshape(*sizes, *row.shape[1:]) for name, row in known.items()}
     meta |= {"width": width, "height": height, "n_batches": n_batches, "n_cameras": n_cameras}
-    meta["tile_size"] = 16 if tile_size is None else tile_size
     # The 2D means as they are in meta are what is blended, so that they get a gradient.
     means2d = meta["means2d"]
     backgrounds = backgrounds.flatten(0, -2) if with_color and backgrounds is not None else None

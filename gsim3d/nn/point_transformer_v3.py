@@ -25,6 +25,7 @@ from gsim3d.nn.point_transformer import (
     run_blocks,
     scaled,
 )
+from gsim3d.ops._arguments import check_tensors
 from gsim3d.ops.curve import CURVES, Pyramid, PyramidSpec, Stage
 
 MIRRORS, DEPTH_RULES = ("block", "mlp"), ("largest", "count")
@@ -165,6 +166,7 @@ class PointTransformerV3(nn.Module):
             InputError: a cell is out of range, or an argument has the wrong shape or dtype; the message names it.
         """
         name, n_curves, spec = type(self).__name__, len(self.config.curves), self.config.pyramid_spec()
+        check_tensors(name, cells=cells, cu_rows=cu_rows)
         if cells.dtype not in (torch.int32, torch.int64) or cells.dim() != 2 or cells.shape[1] != 3:
             raise InputError(f"{name}: cells must be int32 or int64 [N, 3]; got {cells.dtype} {list(cells.shape)}")
         if depth is None:
@@ -188,7 +190,7 @@ class PointTransformerV3(nn.Module):
         return dataclasses.replace(made, stages=tuple(stages))
 
     def forward(self, x: Tensor, pyramid: Pyramid, *, generator: torch.Generator | None = None) -> Tensor:
-        stages = pyramid.stages
+        stages = getattr(pyramid, "stages", ())
         self._check(x, stages)
         x = self.stem(x, stages[0])
         skips = []

@@ -41,6 +41,8 @@ def geometry(indices, kernel_size, stride, padding, dilation, spatial_shape) -> 
     if stride is None:
         if any(k % 2 == 0 for k in kernel):
             raise ValueError(f"from_indices: kernel_size must be odd where there is no stride; got {kernel_size!r}")
+        if any(paddings) or spatial_shape is not None:
+            raise ValueError("from_indices: padding and spatial_shape are of a convolution with stride; give one, or 1")
         return Geometry(list(cells[1:]), edge, list(submanifold_pairs(cells.keys, kernel, dilations)), kernel, None)
     extent = None if spatial_shape is None else per_axis("spatial_shape", spatial_shape, 1)
     strides = per_axis("stride", stride, 1)

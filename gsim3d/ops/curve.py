@@ -194,8 +194,8 @@ class KernelMap:
         Args:
             indices: int32 or int64 [N, 4], in [0, 2^15): batch, then a cell. Rows may share a cell.
             kernel_size: taps an axis; odd ones where there is no stride.
-            stride: None: outputs are the inputs (submanifold). Else outputs are the cells o that a tap reaches from an
-                input: ``o stride + tap dilation - padding`` is its cell.
+            stride: None: outputs are the inputs (submanifold). Else, also with 1, outputs are the cells o that a tap
+                reaches from an input: ``o stride + tap dilation - padding`` is its cell.
             padding: of a convolution with stride.
             dilation: cells between taps.
             spatial_shape: cells an axis of the inputs, which bound the outputs of a stride; None: o >= 0 alone does.
@@ -445,13 +445,11 @@ def build_pyramid(
     if not torch.compiler.is_compiling():
         names = {"positions": positions, "cu_rows": cu_rows, "cloud_scene": cloud_scene, "cloud_slot": cloud_slot}
         check_tensors("build_pyramid", **names, origin=origin)
-        _check_spec(spec, curves)
+        _check_spec(spec, curves, rounded)
         if not (capacity is None or isinstance(capacity, PyramidCapacity)):
             raise TypeError(f"build_pyramid: capacity must be a PyramidCapacity; got {type(capacity).__name__}")
         if depth is not None:
             _check_depth("build_pyramid", depth)
-        if not isinstance(rounded, bool):
-            raise TypeError(f"build_pyramid: rounded must be true or false; got {rounded!r}")
     if curves is None:
         curves = ((0, 1, 2, 3),) * spec.n_stages
     cu_kernels = list(accumulate(map(len, spec.kernel_sizes), initial=0))
@@ -474,11 +472,12 @@ def _check_depth(op: str, depth: int) -> None:
         raise ValueError(f"{op}: depth must be in [1, 16]; got {depth}")
 
 
-def _check_spec(spec: PyramidSpec, curves: tuple[tuple[int, ...], ...] | None) -> None:
+def _check_spec(spec: PyramidSpec, curves: tuple[tuple[int, ...], ...] | None, rounded: bool) -> None:
     check_real("build_pyramid", grid_size=spec.grid_size)
     check_whole("build_pyramid", slot_bits=spec.slot_bits)
-    if not isinstance(spec.release, bool):
-        raise TypeError(f"build_pyramid: release must be true or false; got {spec.release!r}")
+    for name, flag in {"release": spec.release, "rounded": rounded}.items():
+        if not isinstance(flag, bool):
+            raise TypeError(f"build_pyramid: {name} must be true or false; got {flag!r}")
     for name in ("strides", "merge_windows", "patch_sizes"):
         _check_whole_numbers(name, getattr(spec, name))
     for name, rows in {"kernel_sizes": spec.kernel_sizes, "curves": curves or ()}.items():

@@ -64,17 +64,14 @@ def sparse_conv(
         raise ValueError(f'sparse_conv: duplicates must be "mean" or "first"; got {duplicates!r}')
     if check:
         floats = {"x": x, "weight": weight} | ({} if bias is None else {"bias": bias})
-        lists = {name: getattr(voxels, name) for name in ("row_voxel", "rows", "cu_rows")}
-        taps = {name: getattr(kernel_map, name) for name in ("tap_in", "tap_out", "cu_taps")}
+        lists = {name: getattr(voxels, name, voxels) for name in ("row_voxel", "rows", "cu_rows")}
+        taps = {name: getattr(kernel_map, name, kernel_map) for name in ("tap_in", "tap_out", "cu_taps")}
         check_tensors(op, **floats, **lists, **taps)
         check_whole(op, kernel_size=kernel_map.kernel_size)
         check_numbers(op, **floats)
-    if weight.dim() == 5:
-        own, wanted = weight.shape[1], kernel_map.kernel_size
-        if kernel_map.shape is not None:
-            own, wanted = tuple(weight.shape[1:4]), kernel_map.shape
-        if own != wanted:
-            raise ValueError(f"sparse_conv: kernel_map must have the weight's kernel size {own}; got {wanted}")
+    own, wanted = tuple(weight.shape[1:4]), kernel_map.shape or (kernel_map.kernel_size,) * 3
+    if weight.dim() == 5 and own != wanted:
+        raise ValueError(f"sparse_conv: kernel_map must have the weight's kernel size {own}; got {wanted}")
     given = x
     x, weight, bias = widened_on_cpu(x, weight, bias)
     if kernel_map.outputs is not None:

@@ -167,6 +167,11 @@ def test_cameras_are_cast_to_the_dtype_of_the_means():
     expected = rasterization(**arguments, **SIZE, sh_degree=1)[0]
     cameras = {name: arguments[name].double() for name in ("viewmats", "Ks")}
     assert_same_bits(rasterization(**arguments | cameras, **SIZE, sh_degree=1)[0], expected)
+    images = [
+        rasterization(**arguments, **SIZE, sh_degree=1, radial_coeffs=torch.full((2, 6), 0.125).to(dtype))[0]
+        for dtype in (torch.float32, torch.float64)
+    ]
+    assert_same_bits(*images)
 
 
 @pytest.mark.parametrize(
@@ -177,18 +182,28 @@ def test_distorted_cameras(device, camera_model, n_radial, n_tangential):
     arguments = scene_of()
     radial = torch.tensor([[0.1, 0.02, 0.01, -0.02, 0.03, 0.01], [0.05, -0.01, 0.0, 0.02, 0.0, 0.0]]).double()
     tangential = torch.tensor([[0.01, -0.01], [-0.02, 0.01]]).double()
+    radial[:, n_radial:], tangential[:, n_tangential:] = 0, 0
+    leaves = {name: x.clone().requires_grad_() for name, x in arguments.items() if name != "Ks"}
+    moved = {name: x.detach().to(device).requires_grad_() for name, x in leaves.items()}
     given = {"radial_coeffs": radial[:, :n_radial], "tangential_coeffs": tangential[:, :n_tangential]}
     given = {name: x.to(device).requires_grad_() for name, x in given.items() if x.shape[1]}
-    radial[:, n_radial:], tangential[:, n_tangential:] = 0, 0
-    in_order = radial if camera_model == "fisheye" else torch.cat([radial[:, :2], tangential, radial[:, 2:]], 1)
-    lens = "opencv" if camera_model == "pinhole" else camera_model
-    expected, _ = expected_images(arguments, lens=lens, distortion=in_order)
-    moved = {name: x.to(device) for name, x in arguments.items()}
-    color, *_ = rasterization(**moved, **SIZE, camera_model=camera_model, **given)
-    assert_close_relative_to_max(color, expected, "raster_float64")
-    assert relative(color, rasterization(**moved, **SIZE, camera_model=camera_model)[0]) > 1e-2
-    for grad in torch.autograd.grad((color**2).sum(), given.values()):
-        assert grad.abs().max() > 0
+    inputs = [*moved.values(), *given.values()]
+    options, Ks = {"camera_model": camera_model, "rasterize_mode": "antialiased"}, arguments["Ks"]
+    *actual, _ = rasterization(**moved, Ks=Ks.to(device), **SIZE, **options, **given)
+    assert relative(actual[0], rasterization(**moved, Ks=Ks.to(device), **SIZE, **options)[0]) > 1e-2
+    lens, parts = camera_model, {"radial_coeffs": radial.requires_grad_(), "tangential_coeffs": tangential}
+    in_order = radial[:, :4]
+    if camera_model == "pinhole":
+        lens, in_order = "opencv", torch.cat([radial[:, :2], tangential.requires_grad_(), radial[:, 2:]], 1)
+    expected = expected_images(leaves | {"Ks": Ks}, lens=lens, distortion=in_order, antialiased=True)
+    for a, e in zip(actual, expected, strict=True):
+        assert_close_relative_to_max(a, e, "raster_float64")
+    mixes, both = [torch.randn_like(e) for e in expected], []
+    for images, of in ((actual, inputs), (expected, [*leaves.values(), *(parts[name] for name in given)])):
+        both.append(torch.autograd.grad(sum((m.to(x) * x).sum() for m, x in zip(mixes, images)), of))
+    for place, (a, e) in enumerate(zip(*both, strict=True)):
+        e = e[:, : a.shape[1]] if place >= len(moved) else e
+        assert_close_relative_to_max(a, e, "projection_grad_float64", f"gradient {place}")
 
 
 @pytest.mark.parametrize(
@@ -343,6 +358,9 @@ def test_bad_numbers_are_named_on_a_cpu(batch):
         rasterization(**arguments | {"colors": arguments["colors"].float()}, **SIZE)
     with pytest.raises(ValueError, match="width and height must be positive"):
         rasterization(**arguments, width=0, height=4)
+    for eps2d, error in ((-1.0, ValueError), (math.nan, ValueError), ("0.3", TypeError)):
+        with pytest.raises(error, match="rasterization: eps2d must be"):
+            rasterization(**arguments, **SIZE, eps2d=eps2d)
     for wrong in (45.5, True, 2**70):
         with pytest.raises((TypeError, ValueError), match="rasterization: width must"):
             rasterization(**arguments, width=wrong, height=4)

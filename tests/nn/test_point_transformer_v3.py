@@ -161,6 +161,11 @@ def test_arguments_are_checked():
     assert PointTransformerV3(config(depth_rule="count")).pyramid(largest, cu_rows).rows.tolist() == [0]
     with pytest.raises(InputError, match="cells must be int32 or int64"):
         model.pyramid(torch.zeros(1, 3), cu_rows)
+    with pytest.raises(TypeError, match="PointTransformerV3: cells must be a tensor; got ndarray"):
+        model.pyramid(np.zeros((1, 3), int), cu_rows)
+    with pytest.raises(InputError, match=r"pyramid must have 3 levels; got 0; use \.pyramid\(\)"):
+        model(torch.zeros(1, 6), torch.zeros(1, 3))
+    assert config(encoder_channels=[16, 32, 64]).encoder_channels == [16, 32, 64]
     with pytest.raises(InputError, match="permutations must be 3 orders of 4"):
         model.pyramid(torch.zeros(1, 3, dtype=torch.int64), cu_rows, permutations=[[0, 1, 2, 3]])
     with pytest.raises(InputError, match="x must be"):

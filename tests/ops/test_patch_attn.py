@@ -481,3 +481,9 @@ def test_errors(message):
     with pytest.raises(ValueError) as error:
         torch.ops.gsim3d.patch_attention(*{**right, **WRONG[message]}.values())
     assert str(error.value).startswith("patch_attention: ") and message in str(error.value)
+
+
+def test_a_table_that_is_none_is_refused():
+    x = torch.zeros(3, 1, 8)
+    with pytest.raises(TypeError, match="patch_attention: q_rows must be a tensor; got tuple"):
+        patch_attention(x, x, x, (rows(0), rows(0), rows(0, 1), rows(0, 1)))

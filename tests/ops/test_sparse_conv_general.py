@@ -132,6 +132,12 @@ def test_errors():
         "kernel_size must be at most": lambda: KernelMap.from_indices(cells, 33),
         "stride must be at least 1": lambda: KernelMap.from_indices(cells, 2, stride=0),
         "dilation must be a whole number": lambda: KernelMap.from_indices(cells, 3, dilation=1.5),
+        "padding and spatial_shape are of a convolution with stride": lambda: KernelMap.from_indices(
+            cells, 3, padding=1
+        ),
+        "and spatial_shape are of a convolution with stride": lambda: KernelMap.from_indices(
+            cells, spatial_shape=(4,) * 3
+        ),
         "only a convolution with stride": lambda: KernelMap.from_indices(cells)[1].inverse(),
     }.items():
         with pytest.raises((ValueError, TypeError), match=call):
@@ -139,6 +145,8 @@ def test_errors():
     voxels, kernel_map = KernelMap.from_indices(cells, 2, stride=2)
     with pytest.raises(ValueError, match="x must be"):
         sparse_conv(torch.zeros(3, 1), torch.ones(1, 2, 2, 2, 1), None, voxels, kernel_map)
+    with pytest.raises(TypeError, match="sparse_conv: row_voxel must be a tensor; got KernelMap"):
+        sparse_conv(torch.zeros(len(cells), 1), torch.ones(1, 2, 2, 2, 1), None, kernel_map, voxels)
     for shape in ((3, 3, 3), (2, 2, 3)):
         with pytest.raises(ValueError, match="weight's kernel size"):
             sparse_conv(torch.zeros(len(cells), 1), torch.ones(1, *shape, 1), None, voxels, kernel_map)
