@@ -244,7 +244,7 @@ def _colors(colors: Tensor | None, sh_degree: int | None, means: Tensor, viewmat
     if sh_degree is None:
         of_images = colors.shape[:-1] == (*batch, n_cameras, n)
         if not of_images and colors.shape[:-1] != (*batch, n):
-            wanted = f"{[*batch, n, 'D']} or {[*batch, n_cameras, n, 'D']}"
+            wanted = f"{[*batch, n, 'D']} or {[*batch, n_cameras, n, 'D']}".replace("'", "")
             raise ValueError(f"{OP}: colors must be {wanted}; got {list(colors.shape)}")
         if not of_images and n_cameras != 1:
             colors = colors[..., None, :, :].expand(*batch, n_cameras, n, colors.shape[-1])

@@ -114,7 +114,7 @@ def _check(rows: dict[str, Tensor], optional: dict[str, Tensor], cutoff: str) ->
     shapes = {"means2d": (n, 2), "conics": (n, 3), "depths": (n,), "opacities": (n,), "absolute": (n, 2)}
     for name, value in (rows | optional).items():
         if name in shapes and value.shape != shapes[name]:
-            raise ValueError(f"{OP}: {name} must be {['P', *shapes[name][1:]]} with P={n}; got {list(value.shape)}")
+            raise ValueError(f"{OP}: {name} must be {list(shapes[name])}; got {list(value.shape)}")
     colors, cu_pairs, background = rows["colors"], optional.get("cu_pairs"), optional.get("background")
     if colors.dim() != 2 or colors.shape[0] != n or not colors.is_floating_point():
         raise ValueError(f"{OP}: colors must be [P={n}, D] of floats; got {colors.dtype} {list(colors.shape)}")
