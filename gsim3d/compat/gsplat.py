@@ -148,7 +148,7 @@ def rasterization(
         raise ValueError(f"{OP}: eps2d must be finite and not negative; got {eps2d}")
     _check(camera_model, means, viewmats, Ks, opacities, optional)
     batch, n, n_cameras = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
-    viewmats, Ks = viewmats.to(means.dtype), Ks.to(means.dtype)
+    means, viewmats, Ks = (x.to(torch.promote_types(means.dtype, torch.float32)) for x in (means, viewmats, Ks))
     n_batches, n_images = math.prod(batch), math.prod((*batch, n_cameras))
     antialiased = rasterize_mode == "antialiased"
     lens, distortion = _lens(LENSES[camera_model], radial_coeffs, tangential_coeffs, n_images)
@@ -156,7 +156,6 @@ def rasterization(
     cameras = Cameras(viewmats.flatten(0, -3), Ks.flatten(0, -3), unread, unread, unread, width, height)
     shapes = (None, None) if covars is not None else (quats.flatten(0, -2), scales.flatten(0, -2))
     limits = {"near_plane": near_plane, "far_plane": far_plane, "radius_clip": radius_clip, "dilation": eps2d}
-    distortion = None if distortion is None else distortion.to(means.dtype)
     options = {"lens": lens, "distortion": distortion, "jacobian": "clamped", "antialiased": antialiased, **limits}
     options["covars"] = None if covars is None else covars.flatten(0, -3)
     flat_opacities = opacities.flatten()
@@ -256,7 +255,7 @@ def _colors(colors: Tensor | None, sh_degree: int | None, means: Tensor, viewmat
         raise ValueError(f"{OP}: {wanted}; got {list(colors.shape)}")
     sh = colors[..., :n_terms, :]
     turned, moved = viewmats[..., :3, :3], viewmats[..., :3, 3]
-    centre = -(turned.mT @ moved[..., None])[..., 0]
+    centre = -(turned * moved[..., None]).sum(-2)  # autocast would round a product of matrices
     directions = means[..., None, :, :] - centre[..., None, :]
     rows = (directions.flatten(0, -3), sh) if shared else (directions.flatten(0, -4), sh.flatten(0, -4))
     return sh_to_color(*rows).flatten(0, -2)

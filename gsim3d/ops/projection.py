@@ -82,7 +82,7 @@ def project_gaussians(
         means: [N, 3] metres; float32 or float64, the dtype of all others.
         quats: [N, 4] (w, x, y, z), normalised inside; None with ``covars``.
         scales: [N, 3] metres, standard deviations, not negative; None with ``covars``.
-        cameras: I images; ``near`` and ``far`` are not read.
+        cameras: I images, cast to the dtype of ``means``, like ``distortion``; ``near`` and ``far`` are not read.
         covars: [N, 3, 3] m^2, symmetric, in place of ``quats`` and ``scales``; the upper half is read.
         opacities: [N] in [0, 1]; with them radii end where alpha falls below 1/255. They get no gradient.
         lens: "pinhole"; "orthographic": pixels are focal lengths times metres; "opencv": OpenCV's polynomial model;
@@ -129,6 +129,7 @@ def project_gaussians(
         sizes = {name: size for name, size in (("n_clouds", n_clouds), ("n_pairs", n_pairs)) if size is not None}
         _check(tensors, cameras, cu_rows, sizes, lens, jacobian)
     check_real(OP, near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, dilation=dilation)
+    real = torch.promote_types(means.dtype, torch.float32)
     n, n_images, device, image_cloud = means.shape[0], len(cameras), means.device, cameras.image_cloud
     if n_clouds is not None:
         each = n // max(1, n_clouds)
@@ -146,11 +147,11 @@ def project_gaussians(
         n_pairs = int(cu_pairs[-1])
     limits = None
     if distortion is not None:
-        limits = lens_limits(lens, distortion).to(means.dtype)
-        distortion = F.pad(distortion, (0, 8 - distortion.shape[1]))
+        limits = lens_limits(lens, distortion).to(real)
+        distortion = F.pad(distortion.to(real), (0, 8 - distortion.shape[1]))
     args = (
         *(means, quats, scales, covars, None if opacities is None else opacities.detach()),
-        *(cameras.viewmats.to(means.dtype), cameras.Ks.to(means.dtype), distortion, limits),
+        *(cameras.viewmats.to(real), cameras.Ks.to(real), distortion, limits),
         *(image_cloud, cu_rows, cu_pairs, n_pairs, cameras.width, cameras.height),
         *(near_plane, far_plane, radius_clip, dilation, LENSES[lens], jacobian == "clamped", antialiased),
     )

@@ -162,18 +162,6 @@ def test_harmonics(device, batch, sh_degree):
     assert_close_relative_to_max(color, expected, 1e-12)
 
 
-def test_cameras_are_cast_to_the_dtype_of_the_means():
-    arguments = scene_of(dtype=torch.float32) | {"colors": torch.randn(40, 4, 3)}
-    expected = rasterization(**arguments, **SIZE, sh_degree=1)[0]
-    cameras = {name: arguments[name].double() for name in ("viewmats", "Ks")}
-    assert_same_bits(rasterization(**arguments | cameras, **SIZE, sh_degree=1)[0], expected)
-    images = [
-        rasterization(**arguments, **SIZE, sh_degree=1, radial_coeffs=torch.full((2, 6), 0.125).to(dtype))[0]
-        for dtype in (torch.float32, torch.float64)
-    ]
-    assert_same_bits(*images)
-
-
 @pytest.mark.parametrize(
     ("camera_model", "n_radial", "n_tangential"),
     [("pinhole", 6, 2), ("pinhole", 6, 0), ("pinhole", 4, 0), ("pinhole", 0, 2), ("fisheye", 4, 0)],
