@@ -30,13 +30,13 @@ int main(int argc, char** argv) {
   std::ifstream file(argc == 3 ? argv[1] : "", std::ios::binary);
   std::map<Bytes, size_t> column;
   int64_t n = 0;
-  for (Bytes word, type; file >> word && word != "end_header" && word != "ascii" && word != "mip";)
-    if (word == "vertex") file >> n;
-    else if (word == "antialiased" && file >> word && word == "1") break;
+  for (Bytes word, type; file >> word && word != "end_header" && word != "mip";)
+    if (word == "ascii" || word == "binary_big_endian" || (word == "antialiased" && file >> word && word == "1")) break;
+    else if (word == "vertex") file >> n;
     else if (word == "property" && file >> type >> word) column.emplace(word, column.size()), n *= type == "float";
   std::vector<float> rows(n * column.size()), means, quats, scales, opacities, color, low(3, 1e9f), high(3, -1e9f);
   if (!n || !file.ignore() || !file.read((char*)rows.data(), rows.size() * 4) || !column.count("rot_3"))
-    return std::cerr << "usage: render_ply IN.ply OUT.png, of a binary .ply with floats, not of Mip-Splatting\n", 1;
+    return std::cerr << "usage: render_ply IN.ply OUT.png, a little-endian .ply of floats, not of Mip-Splatting\n", 1;
   for (const float* row = rows.data(); row != rows.data() + rows.size(); row += column.size()) {
     for (const char* name : {"x", "y", "z"}) means.push_back(row[column.at(name)]);
     for (const char* name : {"rot_0", "rot_1", "rot_2", "rot_3"}) quats.push_back(row[column.at(name)]);

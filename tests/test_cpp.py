@@ -85,7 +85,7 @@ def render(program, folder):
         b"element": b"comment SplatRenderMode: mip\nelement",
         b"element vertex": b"comment antialiased 1\nelement vertex",
     }
-    bad = [good.replace(part, other) for part, other in wrong.items()]
+    bad = [good.replace(b"little", b"big"), *(good.replace(part, other) for part, other in wrong.items())]
     (folder / "in.ply").write_bytes(good.replace(b"element vertex", b"comment antialiased 0\nelement vertex"))
     run(program, folder / "in.ply", folder / "out.png")
     for data in (b"ply\nelement vertex 3\nend_header\n", *bad):
