@@ -122,7 +122,7 @@ def joint_attention(
 
 
 def _lists(table: PatchTable, prefix: str = "") -> dict[str, Tensor]:
-    return {f"{prefix}{name}": getattr(table, name, table) for name in ("q_rows", "kv_rows", "cu_q", "cu_k")}
+    return {f"{prefix}table.{name}": getattr(table, name, table) for name in ("q_rows", "kv_rows", "cu_q", "cu_k")}
 
 
 def _scale(q: Tensor, scale: float | None) -> float:

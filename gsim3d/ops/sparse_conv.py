@@ -64,8 +64,8 @@ def sparse_conv(
         raise ValueError(f'sparse_conv: duplicates must be "mean" or "first"; got {duplicates!r}')
     if check:
         floats = {"x": x, "weight": weight} | ({} if bias is None else {"bias": bias})
-        lists = {name: getattr(voxels, name, voxels) for name in ("row_voxel", "rows", "cu_rows")}
-        taps = {name: getattr(kernel_map, name, kernel_map) for name in ("tap_in", "tap_out", "cu_taps")}
+        lists = {f"voxels.{name}": getattr(voxels, name, voxels) for name in ("row_voxel", "rows", "cu_rows")}
+        taps = {f"kernel_map.{key}": getattr(kernel_map, key, kernel_map) for key in ("tap_in", "tap_out", "cu_taps")}
         check_tensors(op, **floats, **lists, **taps)
         check_whole(op, kernel_size=kernel_map.kernel_size)
         check_numbers(op, **floats)

@@ -485,5 +485,5 @@ def test_errors(message):
 
 def test_a_table_that_is_none_is_refused():
     x = torch.zeros(3, 1, 8)
-    with pytest.raises(TypeError, match="patch_attention: q_rows must be a tensor; got tuple"):
+    with pytest.raises(TypeError, match="patch_attention: table.q_rows must be a tensor; got tuple"):
         patch_attention(x, x, x, (rows(0), rows(0), rows(0, 1), rows(0, 1)))

@@ -145,7 +145,7 @@ def test_errors():
     voxels, kernel_map = KernelMap.from_indices(cells, 2, stride=2)
     with pytest.raises(ValueError, match="x must be"):
         sparse_conv(torch.zeros(3, 1), torch.ones(1, 2, 2, 2, 1), None, voxels, kernel_map)
-    with pytest.raises(TypeError, match="sparse_conv: row_voxel must be a tensor; got KernelMap"):
+    with pytest.raises(TypeError, match="sparse_conv: voxels.row_voxel must be a tensor; got KernelMap"):
         sparse_conv(torch.zeros(len(cells), 1), torch.ones(1, 2, 2, 2, 1), None, kernel_map, voxels)
     for shape in ((3, 3, 3), (2, 2, 3)):
         with pytest.raises(ValueError, match="weight's kernel size"):
