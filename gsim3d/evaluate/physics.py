@@ -16,7 +16,7 @@ from gsim3d.data import Scene
 from gsim3d.data.actions import UNREADABLE
 from gsim3d.errors import InputError, naming
 from gsim3d.state import DYNAMIC, Particles
-from gsim3d.synth.embedding import ParticleCloud
+from gsim3d.synth.embedding import ParticleCloud, bind_deformed
 
 GRAVITY = 9.81  # m/s^2
 MARGIN = 0.5  # metres around the scene's bounds
@@ -110,17 +110,17 @@ def measure_tracks(tracks: Mapping[str, Tensor], scene: Scene, steps: range) -> 
 
 
 def carried(points: Tensor, bodies: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-    """Returns where bodies, nodes [S, M, 3] each, carry ``points`` [N, 3] of their first step, float64 [S, N, 3], and
-    which carries each, int64 [N]: that of the nearest node; of the 4 axes of a rigid one, the first is its origin."""
+    """Returns where bodies of :func:`true_states` carry ``points`` [N, 3] of their first step, float64 [S, N, 3], and
+    which, int64 [N]: that of the nearest node; of the 4 axes of a rigid one, the first is its origin."""
     points = points.double()
-    starts = [own[0, :1] if own.shape[1] == 4 else own[0] for own in bodies]
+    starts = [own[0, :1] if own.shape[1] == 4 and own.ndim == 3 else own[0].flatten(0, -2) for own in bodies]
     body = torch.stack([torch.cdist(points, start.double()).amin(1) for start in starts]).argmin(0)
     moved = points.repeat(min(map(len, bodies)), 1, 1)
     for number, nodes in enumerate(bodies):
         if (own := body == number).any():
-            cloud = ParticleCloud(nodes.double().numpy())
-            binding = cloud.bind(points[own].numpy())
-            moved[:, own] = torch.from_numpy(np.stack([binding.move(cloud.nodes[step]) for step in range(len(moved))]))
+            steps, inside = nodes.double().numpy()[: len(moved)], points[own].numpy()
+            binding = bind_deformed(steps[0], inside) if steps.ndim == 5 else ParticleCloud(steps).bind(inside)
+            moved[:, own] = torch.from_numpy(np.stack([binding.move(step) for step in steps]))
     return moved, body
 
 
@@ -153,8 +153,9 @@ def fall_ratio(given: Sequence[float], height: float, n_steps: int, fps: float) 
 
 
 def true_states(scene: Scene) -> list[Tensor] | None:
-    """Returns the nodes [S, N, 3] of each body and cloth as generated, at the scene's steps; None if it has no
-    ``states.npz``, or is not in metres. Raises InputError if the file is damaged, or shorter than the scene."""
+    """Returns the nodes of each body and cloth as generated at the scene's steps, [S, N, 3], of control grids
+    [S, c+1, c+1, c+1, 3]; None if it has no ``states.npz``, or is not in metres. Raises InputError if the file is
+    damaged, or shorter than the scene."""
     file = scene.path / "states.npz"
     if not file.is_file() or scene.fitting.unit_cameras:
         return None
@@ -165,8 +166,13 @@ def true_states(scene: Scene) -> list[Tensor] | None:
         if nodes.ndim < 3 or nodes.shape[-1] != 3 or not nodes.isfinite().all():
             raise InputError(f"{file}: each body must be [T, ..., 3] finite numbers; got {list(nodes.shape)}")
     stride = round(scene.generated.get("fps", scene.fps) / scene.fps)
-    flat = [nodes[::stride].flatten(1, -2) for nodes in found]
-    if flat and min(map(len, flat)) < scene.n_steps:
+    found = [nodes[::stride] for nodes in found]
+    if found and min(map(len, found)) < scene.n_steps:
         raise InputError(f"{file}: {min(map(len, found))} steps, fewer than the scene has")
-    # A lattice has unused nodes, at the origin.
-    return [nodes[:, ~(nodes == 0).all(-1).any(0)] - torch.from_numpy(scene.world_offset) for nodes in flat] or None
+    return [_used(nodes) - torch.from_numpy(scene.world_offset) for nodes in found] or None
+
+
+def _used(nodes: Tensor) -> Tensor:
+    """Nodes [S, ..., 3] as a list [S, N, 3] without unused ones, at the origin; those of a whole lattice as given."""
+    unused = (nodes == 0).all(-1).any(0)
+    return nodes if nodes.ndim == 5 and not unused.any() else nodes.flatten(1, -2)[:, ~unused.flatten()]

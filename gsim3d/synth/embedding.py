@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-LEAST_WEIGHT = 0.3  # of a node in any vertex, relative to the largest of all nodes
+LEAST_WEIGHT = 0.03  # of a node in any vertex, relative to the largest of all nodes
+NEWTON_STEPS, MOST_CHANGE = 15, 0.3  # to find a point in a deformed grid, and the largest change in cells
 NEIGHBOURS = 12  # particles that a point is bound to; an affine motion needs four in general position
 
 
@@ -46,14 +47,33 @@ class ControlGrid:
         position = (points - low) / (high - low) * n
         cells = np.argwhere(self.occupied)
         outside = np.maximum(np.abs(position[:, None] - (cells[None] + 0.5)) - 0.5, 0)
-        cell = cells[(outside**2).sum(-1).argmin(1)]
-        part = position - cell
-        corners, weights = [], []
-        for step in np.ndindex(2, 2, 2):
-            corner = cell + np.array(step)
-            corners.append((corner[:, 0] * (n + 1) + corner[:, 1]) * (n + 1) + corner[:, 2])
-            weights.append(np.where(np.array(step) == 1, part, 1 - part).prod(1))
-        return Binding(np.stack(corners, 1), np.stack(weights, 1))
+        return _trilinear(position, cells[(outside**2).sum(-1).argmin(1)], n)
+
+
+def bind_deformed(nodes: np.ndarray, points: np.ndarray) -> Binding:
+    """Binds ``points`` [N, 3] to the nearest cells of a deformed control grid [c+1, c+1, c+1, 3], by trilinear weights:
+    Newton's method, from affine motions of the nodes around."""
+    n, flat = nodes.shape[0] - 1, nodes.reshape(-1, 3)
+    indices = np.argwhere(np.ones(nodes.shape[:-1])).astype(np.float64)
+    position = ParticleCloud(flat[None]).bind(points).move(indices)
+    for _ in range(NEWTON_STEPS):
+        cell = np.clip(np.floor(position), 0, n - 1).astype(np.int64)
+        axes = [_trilinear(position + step, cell, n).move(flat) for step in (*np.eye(3), *-np.eye(3))]
+        jacobian = np.stack([(axes[a] - axes[a + 3]) / 2 for a in range(3)], 2)  # exact: linear along each axis
+        change = np.einsum("nij,nj->ni", np.linalg.pinv(jacobian), points - _trilinear(position, cell, n).move(flat))
+        position += change * np.minimum(1, MOST_CHANGE / np.linalg.norm(change, axis=1, keepdims=True).clip(1e-9))
+    return _trilinear(position, np.clip(np.floor(position), 0, n - 1).astype(np.int64), n)
+
+
+def _trilinear(position: np.ndarray, cell: np.ndarray, n: int) -> Binding:
+    """Binds ``position`` [N, 3] in cells to the corners of ``cell`` [N, 3], of n along each axis."""
+    part = position - cell
+    corners, weights = [], []
+    for step in np.ndindex(2, 2, 2):
+        corner = cell + np.array(step)
+        corners.append((corner[:, 0] * (n + 1) + corner[:, 1]) * (n + 1) + corner[:, 2])
+        weights.append(np.where(np.array(step) == 1, part, 1 - part).prod(1))
+    return Binding(np.stack(corners, 1), np.stack(weights, 1))
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from gsim3d.errors import InputError
 from gsim3d.evaluate.physics import (
     MEASURES,
     TRUE,
+    carried,
     fall_ratio,
     measure,
     measure_tracks,
@@ -181,6 +182,16 @@ def test_states_of_the_generator(tmp_path):
     nodes[1:, 0, 0] = 0  # of no cell of the lattice
     np.savez(scene.path / "states.npz", ball=nodes, actors=nodes)
     assert [body.shape for body in true_states(scene)] == [(scene.n_steps, 3, 3)]
+    lattice = np.stack(np.meshgrid(*[np.arange(3.0)] * 3, indexing="ij"), -1) + 1
+    bent = lattice + 0.1 * np.sin(3 * lattice[..., [2, 0, 1]])
+    np.savez(scene.path / "states.npz", jelly=np.stack([lattice, bent] * scene.n_steps)[: scene.n_steps])
+    assert [body.shape for body in true_states(scene)] == [(scene.n_steps, 3, 3, 3, 3)]
+    centers = torch.from_numpy((lattice[:-1, :-1, :-1] + 0.5).reshape(-1, 3))
+    moved, body = carried(centers, true_states(scene))
+    around = np.lib.stride_tricks.sliding_window_view(bent, (2, 2, 2), (0, 1, 2)).reshape(8, 3, 8).mean(2)
+    assert body.tolist() == [0] * 8
+    torch.testing.assert_close(moved[1], torch.from_numpy(around))
+    torch.testing.assert_close(moved[2], centers)
     np.savez(scene.path / "states.npz", actors=nodes)
     assert true_states(scene) is None
     for bad in (np.full((9, 2, 3), np.nan), np.zeros((9, 3)), np.array([{}], dtype=object), nodes[1:]):

@@ -254,6 +254,27 @@ def test_states_hold_nodes_that_hardly_move_a_vertex():
     np.testing.assert_allclose(found[1, 0, 0, 0], [1.1, 1.1, 1.1], atol=1e-6)
 
 
+def test_points_bind_to_a_deformed_control_grid(motion):
+    grid, vertices = motion
+    nodes = embedding.states(grid)
+    assert (
+        abs(
+            np.linalg.norm(nodes[15, 3, 0, 0] - nodes[15, 0, 0, 0])
+            / np.linalg.norm(nodes[0, 3, 0, 0] - nodes[0, 0, 0, 0])
+            - 1
+        )
+        > 0.01
+    )
+    for step in (3, 15):
+        binding = embedding.bind_deformed(nodes[step], vertices[step])
+        np.testing.assert_allclose(binding.move(nodes[step]), vertices[step], atol=1e-6)
+        for later in (0, 8, 15):
+            off = np.linalg.norm(binding.move(nodes[later]) - vertices[later], axis=1)
+            assert off.mean() < 1e-3, (step, later)
+    beside = vertices[15] + np.random.default_rng(0).normal(size=vertices[15].shape) * 0.02  # inside and outside
+    np.testing.assert_allclose(embedding.bind_deformed(nodes[15], beside).move(nodes[15]), beside, atol=1e-6)
+
+
 def test_simulation_repeats_bit_by_bit(motion, ball):
     assert np.array_equal(motion[0].nodes, move([ball], 16)[1][0].nodes)
 
