@@ -64,6 +64,17 @@ def test_backward(device, sh_terms, cutoff, jacobian, dtype):
         assert_close_relative_to_max(a, e, f"raster_grad_{DTYPES[dtype]}", name)
 
 
+@pytest.mark.parametrize("dtype", DTYPES, ids=DTYPES.values())
+def test_gradients_of_gaussians_over_many_tiles(device, dtype):
+    # On a GPU a warp shares the sums of a Gaussian over more than 32 quarters of tiles; here up to 99.
+    scene = random_scene(n=40, clouds=1, images=2, width=85, height=67, sh_terms=4, seed=8)
+    scene = scene.replace(scales=3 * scene.scales, opacities=0.6 * scene.opacities)
+    expected = gradients(scene.render_oracle, scene)
+    moved = scene.to(dtype).to(device)
+    for name, a, e in zip(Scene.NAMES, gradients(moved.render, moved), expected, strict=True):
+        assert_close_relative_to_max(a, e, f"raster_grad_{DTYPES[dtype]}", name)
+
+
 def test_gradients_of_many_rows(device):
     # More rows than a chunk holds: sums over rows (viewmats, background) add up chunks.
     scene = random_scene(n=2500, clouds=1, images=1, width=9, height=7, sh_terms=0, n_features=1, spread=0.3, seed=1)
