@@ -394,7 +394,8 @@ def test_scores_against_windows_are_printed_with_paired_differences(first_run, t
     curve.main([str(state_file(state, name)) for name in ("a", "b")])
     said = capsys.readouterr().out
     assert "| 1 | 0 | 21.50 | 19.50 | 12.00 | 16.00 |" in said
-    assert "b against a: past +0.00 ± 0.00 (within two standard errors)" in said
+    a, b = (state_file(state, name) for name in ("a", "b"))
+    assert f"{b} against {a}: past +0.00 ± 0.00 (within two standard errors)" in said
     assert "future +0.50 ± 0.29 (within two standard errors)" in said
     other = dataclasses.replace(done, scores=[{**entry, "scenes": {"t": [1.0] * 4}}])
     save_state(trainer, state, "b", other)

@@ -64,7 +64,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("states", type=Path, nargs="+", metavar="STATE", help="NAME.state.safetensors")
     args = parser.parse_args(arguments)
     names = [path.name.removesuffix(".state.safetensors") for path in args.states]
-    found = {name: load_progress(path.parent, name) for name, path in zip(names, args.states, strict=True)}
+    found = {str(path): load_progress(path.parent, name) for name, path in zip(names, args.states, strict=True)}
     for name, progress in found.items():
         if not progress.scores:
             raise InputError(f"{name}: no state, or one without scores")
