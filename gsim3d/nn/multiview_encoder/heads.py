@@ -128,7 +128,6 @@ class ParticleHeads(nn.Module):
 
     def explicit_gaussians(self, raw: Tensor, depth: Tensor, geometry: PixelRays) -> dict[str, Tensor]:
         """quats, scales and sh of the explicit variant, predicted in the camera frame and turned into the world."""
-        n_images = raw.shape[0]
         raw_scales, raw_quats, raw_sh = _rows(raw).split([3, 4, raw.shape[1] - 7], -1)
         smallest, largest = self.config.scale_range
         pixel_size = geometry.inverse_Ks[:, :2, :2].sum((1, 2)).to(raw.dtype)[:, None, None]
@@ -137,10 +136,11 @@ class ParticleHeads(nn.Module):
         quats = quat_product(rotation_to_quat(rotations)[:, None], unit_quats(raw_quats.roll(1, -1)))  # raw: w last
         quats = with_positive_largest(quats)  # as those that the dynamics writes and reads
         damping = degree_damping(self.config.sh_degree, raw)
-        in_camera = raw_sh.reshape(n_images, -1, 3, damping.shape[0]) * damping
-        each = torch.eye(len(damping), dtype=geometry.rotations.dtype, device=raw.device).repeat(n_images, 1, 1)
+        in_camera = raw_sh.reshape(raw.shape[0], -1, 3, damping.shape[0]) * damping
+        each = torch.eye(len(damping), dtype=geometry.rotations.dtype, device=raw.device).repeat(raw.shape[0], 1, 1)
         sh = self.rotate_harmonics(each, geometry.rotations).to(raw.dtype)
-        return {"quats": quats, "scales": scales, "sh": torch.einsum("ikl,incl->inkc", sh, in_camera)}
+        sh = torch.einsum("ikl,incl->inkc", sh, in_camera).to(raw.dtype)  # autocast narrows it
+        return {"quats": quats, "scales": scales, "sh": sh}
 
     def rotate_harmonics(self, sh: Tensor, rotations: Tensor) -> Tensor:
         """Predicted coefficients [N, K, C] turned into the world by ``rotations`` [N, 3, 3]."""

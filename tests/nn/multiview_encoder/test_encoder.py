@@ -305,6 +305,13 @@ def test_explicit_variant(prepare):
     assert torch.allclose(particles.quats.norm(dim=-1), torch.ones(n), atol=1e-5) and particles.scales.min() > 0
 
 
+def test_explicit_particles_are_float32_under_autocast():
+    encoder = make_encoder(explicit=True, dynamic_dim=0, static_dim=0)
+    with torch.autocast("cpu", torch.bfloat16):
+        particles = encoder(make_frames([0, 0]))
+    assert {value.dtype for value in (particles.quats, particles.scales, particles.sh)} == {torch.float32}
+
+
 def rotations(n: int) -> torch.Tensor:
     q, _ = torch.linalg.qr(torch.randn(n, 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)))
     return q * torch.linalg.det(q)[:, None, None]
