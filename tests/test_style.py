@@ -24,7 +24,6 @@ STORED = (
     "tools/release/state/",
     "tests/compat/",
     "tests/test_style.py",
-    "tools/compare_trees.py",
 )
 # Areas whose owners have not landed yet.
 PENDING: tuple[str, ...] = ()
