@@ -365,11 +365,12 @@ def score_scenes(
     clips: int = CLIPS,
     processes: Processes | None = None,
     quiet: bool = True,
+    start: int = 0,
 ) -> list[SceneScores]:
     """Scores scenes with :func:`score_scene`; a GPU predicts several per rollout.
 
     Args:
-        restored, n_encoded, n_future, metrics, methods: see :func:`score_scene`.
+        restored, n_encoded, n_future, metrics, methods, start: see :func:`score_scene`.
         scenes: scenes to predict.
         views: (context, target) cameras of each scene.
         others: predictions of other models for each scene.
@@ -378,19 +379,18 @@ def score_scenes(
             in bits to those of a single process.
         quiet: hide the progress bar.
     """
-    processes = processes or Processes()
-    groups = [[number] for number in range(len(scenes))]
+    processes, groups = processes or Processes(), [[number] for number in range(len(scenes))]
     if restored is not None:
         groups = _batches(restored, scenes, [context for context, _ in views])
     n_for_fvd = min(len(scenes), max(1, clips // max(len(targets) for _, targets in views)))
     for_fvd = {k * len(scenes) // n_for_fvd for k in range(n_for_fvd)}
-    given = {"n_encoded": n_encoded, "n_future": n_future, "methods": methods}
+    given = {"n_encoded": n_encoded, "n_future": n_future, "methods": methods, "start": start}
 
     def scored(group: Sequence[int]) -> Iterator[tuple[int, SceneScores]]:
         predictions = [None] * len(group)
         if len(group) > 1:
-            contexts = [views[number][0] for number in group]
-            predictions = predict_together(restored, [scenes[number] for number in group], n_future, contexts)
+            together = [scenes[number] for number in group], n_future, [views[number][0] for number in group]
+            predictions = predict_together(restored, *together, start=start)
         for number, prediction in zip(group, predictions, strict=True):
             (context, targets), own = views[number], [m for m in metrics if m != "fvd" or number in for_fvd]
             cams = {"context_cams": context, "target_cams": targets, "others": others[number] if others else ()}

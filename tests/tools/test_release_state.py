@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import math
+import shutil
 import threading
 import time
 import types
@@ -30,7 +31,15 @@ from gsim3d.train.samples import draw_batch
 from tools.release import curve, recipes, runs
 from tools.release.recipes import WORLDS, recipe
 from tools.release.runs import RunTrainer, train
-from tools.release.state import Progress, load_into, load_progress, save_state, state_file, weights_file
+from tools.release.state import (
+    Progress,
+    begun_with,
+    load_into,
+    load_progress,
+    save_state,
+    state_file,
+    weights_file,
+)
 from tools.release.trajectories import DataWorkers, TrajectoryStore
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -301,6 +310,30 @@ def test_a_state_of_another_model_is_refused(first_run, store, tmp_path):
         load_into(RunTrainer(config, store, tmp_path / "other", "cpu"), state, NAME)
 
 
+def test_an_arm_begins_with_the_state_of_another(first_run, store, tmp_path):
+    trainer, state, done = first_run
+    scored = dataclasses.replace(done, scores=[{"windows": 1, "past": 20.0}])
+    save_state(trainer, state, NAME, scored)
+    source, progress = begun_with(state, "ball-other", NAME)
+    assert (source, progress.step, progress.next_trajectory, progress.scores) == (NAME, 3, 7, [])
+    assert begun_with(state, NAME, NAME)[1].scores and begun_with(state, "ball-other", "")[0] == "ball-other"
+    with pytest.raises(InputError, match="--begin-with"):
+        begun_with(state, "ball-other", "ball-none")
+    config = dataclasses.replace(CONFIG, model={"dynamics": {"mlp_ratio": 4, "time_embedding": False}})
+    other = RunTrainer(config, store, tmp_path / "other", "cpu")
+    first = {name: value.clone() for name, value in other.parameters.items()}
+    assert load_into(other, state, source, differs=True).step == other.step == 3
+    assert other.new_parameters and all(".mlp." in name for name in other.new_parameters)
+    for name, value in other.parameters.items():
+        known = first[name] if name in other.new_parameters else trainer.average[name]
+        assert (value - known).abs().max() <= known.abs().max() / 127, name
+        assert not other.optimizer.state[value] or name not in other.new_parameters
+    other.begin_run(time.monotonic() + 60)
+    assert np.isfinite(other.train_step()["loss"])
+    save_state(other, state, "ball-other", progress)
+    assert begun_with(state, "ball-other", NAME)[1].step == 4
+
+
 @pytest.mark.parametrize("is_last", [False, True])
 def test_run_ends_on_time_and_last_one_decays(store, tmp_path, monkeypatch, is_last):
     monkeypatch.setattr(runs, "WARM_UP", 1)
@@ -363,6 +396,13 @@ def test_recipes_are_sound(world, arm):
     assert model.actions == tuple(acting) == stream.effects().dynamics.actions
 
 
+def test_rows_of_ablations_are_arms():
+    made, base = recipe("elastic", "rollout-2"), recipe("elastic")
+    assert made.name == "elastic-rollout-2" and made.train.phases[0] == base.train.phases[0]
+    assert {phase.horizon for phase in made.train.phases} == {0, 2} and made.train.data == base.train.data
+    assert model_config(recipe("elastic", "latent").train) == model_config(base.train)
+
+
 @pytest.mark.parametrize("world, arm", [("water", "pure"), ("elastic", "magic")])
 def test_an_unknown_recipe_is_refused(world, arm):
     with pytest.raises(InputError, match="choose from"):
@@ -394,9 +434,24 @@ def test_scores_against_windows_are_printed_with_paired_differences(first_run, t
     curve.main([str(state_file(state, name)) for name in ("a", "b")])
     said = capsys.readouterr().out
     assert "| 1 | 0 | 21.50 | 19.50 | 12.00 | 16.00 |" in said
-    a, b = (state_file(state, name) for name in ("a", "b"))
-    assert f"{b} against {a}: past +0.00 ± 0.00 (within two standard errors)" in said
+    assert "b against a at 1 windows: past +0.00 ± 0.00 (within two standard errors)" in said
     assert "future +0.50 ± 0.29 (within two standard errors)" in said
+    later = [{**entry, "windows": windows, "past": 0.0} for windows in (2, 3)]
+    for name, scores in (("a", [entry, *later]), ("b", [entry, later[0]])):
+        save_state(trainer, state, name, dataclasses.replace(done, scores=scores))
+    curve.main([str(state_file(state, name)) for name in ("a", "b")])
+    assert "b against a at 2 windows" in capsys.readouterr().out
+    save_state(trainer, state, "b", dataclasses.replace(done, scores=[{**entry, "windows": 9}]))
+    curve.main([str(state_file(state, name)) for name in ("a", "b")])
+    assert "b against a at 9 and 3 windows" in capsys.readouterr().out
+    (tmp_path / "b").mkdir()
+    save_state(trainer, tmp_path / "b", "a", done)  # of the same name
+    files = state_file(state, "a"), state_file(tmp_path / "b", "a")
+    with pytest.raises(InputError, match="a: no state, or one without scores"):
+        curve.main([str(file) for file in files])
+    save_state(trainer, tmp_path / "b", "a", dataclasses.replace(done, scores=[entry]))
+    curve.main([str(file) for file in files])
+    assert f"{files[1]} against {files[0]} at 1 windows" in capsys.readouterr().out
     other = dataclasses.replace(done, scores=[{**entry, "scenes": {"t": [1.0] * 4}}])
     save_state(trainer, state, "b", other)
     with pytest.raises(InputError, match="different trajectories"):
@@ -415,6 +470,9 @@ def test_committed_states_are_read_and_load(file, tmp_path, capsys):
     made = recipe(*name.split("-"))
     trainer = RunTrainer(made.train, TrajectoryStore(made.stream(), 1, "cpu"), tmp_path, "cpu")
     before = {key: value.clone() for key, value in trainer.parameters.items()}
+    shutil.copy(file, tmp_path)
+    assert curve.write_weights(tmp_path, name) == weights_file(tmp_path, name)
+    assert restore(weights_file(tmp_path, name)).image_size == (128, 128)
     progress = load_into(trainer, STATES, name)
     assert trainer.step == progress.step > 0 and progress.windows > 1_000
     moments = [trainer.optimizer.state[parameter].get("exp_avg_sq") for parameter in trainer.parameters.values()]

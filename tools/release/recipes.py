@@ -1,4 +1,7 @@
-"""Recipes of the simulators that are trained for release: configs/train/WORLD.yaml, and arms beside it."""
+"""Recipes of the simulators that are trained for release: configs/train/WORLD.yaml, and arms beside it.
+
+Every row of gsim3d/evaluate/ablations.yaml is an arm, too: the recipe with one change.
+"""
 
 import dataclasses
 from dataclasses import dataclass, field
@@ -6,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gsim3d.errors import InputError
+from gsim3d.evaluate.ablations import changed, load_ablations
 from gsim3d.io.files import read_yaml
 from gsim3d.io.settings import from_dict
 from gsim3d.synth.world import World
@@ -46,18 +50,19 @@ def recipe(world: str, arm: str = "velocity") -> Recipe:
     Raises:
         InputError: there is no such world or arm, or the world has no priors.
     """
-    arms = read_yaml(CONFIGS / "arms.yaml")
-    for given, known in ((world, WORLDS), (arm, arms)):
+    arms, rows = read_yaml(CONFIGS / "arms.yaml"), load_ablations()[1]
+    for given, known in ((world, WORLDS), (arm, (*arms, *rows))):
         if given not in known:
             raise InputError(f"{given!r} is not known; choose from {', '.join(known)}")
     settings = read_yaml(CONFIGS / f"{world}.yaml")
     for part in ("all", world):
-        settings = merged(settings, arms[arm].get(part, {}))
+        settings = merged(settings, arms.get(arm, {}).get(part, {}))
     if arm == "priors":
         if not (CONFIGS.parent / "priors" / f"{world}.yaml").is_file():
             raise InputError(f"the world {world} has no priors; choose another arm")
         settings = merged(settings, {"model": {"dynamics": read_yaml(CONFIGS.parent / "priors" / f"{world}.yaml")}})
-    return Recipe(f"{world}-{arm}", world, from_dict(TrainConfig, settings))
+    train = from_dict(TrainConfig, settings)
+    return Recipe(f"{world}-{arm}", world, changed(train, rows[arm].change) if arm in rows else train)
 
 
 def merged(settings: dict, changes: dict) -> dict:

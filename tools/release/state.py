@@ -68,11 +68,26 @@ def load_progress(folder: str | Path, name: str) -> Progress:
     return _read(state_file(folder, name))[0] if state_file(folder, name).is_file() else Progress()
 
 
-def load_into(trainer: Trainer, folder: str | Path, name: str) -> Progress:
+def begun_with(folder: str | Path, name: str, first: str) -> tuple[str, Progress]:
+    """The run whose state run ``name`` goes on from, and the progress there: its own, or else ``first``, if not "".
+
+    Raises:
+        InputError: there is no state of ``first``, where it is needed, or a state is damaged.
+    """
+    if not first or state_file(folder, name).is_file():
+        return name, load_progress(folder, name)
+    if not state_file(folder, first).is_file():
+        raise InputError(f"{state_file(folder, first)}: does not exist; --begin-with needs it")
+    return first, dataclasses.replace(load_progress(folder, first), scores=[])  # which are of another model
+
+
+def load_into(trainer: Trainer, folder: str | Path, name: str, *, differs: bool = False) -> Progress:
     """Weights, second moments and capacity of graphs of run ``name`` into a new trainer.
 
     Parameters of priors that the state's model did not have stay as they are; ``trainer.new_parameters`` names them.
 
+    Args:
+        differs: the state is of another model: all parameters that it lacks, or has in another size, stay as they are.
     Returns:
         The progress so far; of a new run, whose trainer stays as it is, where ``folder`` has no state.
     Raises:
@@ -84,17 +99,17 @@ def load_into(trainer: Trainer, folder: str | Path, name: str) -> Progress:
     progress, tensors = _read(file)
     own = trainer.simulator.state_dict()
     try:
-        if trainer.captured and progress.needed:
+        if trainer.captured and progress.needed and not differs:
             trainer.captured.reserve(progress.needed)
-        trainer.new_parameters = [key for key in own if key not in tensors and f"{key}.int8" not in tensors]
-        if other := [key for key in trainer.new_parameters if not key.startswith(PRIORS)]:
-            raise KeyError(f"it has no {other[0]}")
+        trainer.new_parameters = [key for key in own if not _has(tensors, key, own[key].shape)]
+        if not differs and (other := [key for key in trainer.new_parameters if not key.startswith(PRIORS)]):
+            raise KeyError(f"it has no {other[0]} of shape {list(own[other[0]].shape)}")
         known = own.keys() - set(trainer.new_parameters)
         weights = {key: _unpacked(tensors, key, own[key].shape) for key in known}
         trainer.simulator.load_state_dict(weights, strict=False)
         trainer.average = {key: value.clone() for key, value in trainer.simulator.state_dict().items()}
         for key, parameter in trainer.parameters.items():
-            if f"{key}.squares" in tensors or f"{key}.rows" in tensors:
+            if key in known and (f"{key}.squares" in tensors or f"{key}.rows" in tensors):
                 squares = _squares(tensors, key, parameter.shape)
                 moments = {"step": torch.tensor(float(progress.step)), "exp_avg_sq": squares}
                 trainer.optimizer.restore(parameter, {**moments, "exp_avg": torch.zeros_like(squares)})
@@ -152,6 +167,11 @@ def _packed(key: str, value: Tensor) -> dict[str, Tensor]:
     rounded = torch.where(steps > 0, blocks / steps.clamp(min=torch.finfo(torch.float32).tiny), 0).round()
     levels = rounded.clamp(-LEVELS, LEVELS).to(torch.int8).view(-1)[: len(flat)]
     return {f"{key}.int8": levels, f"{key}.scales": scales}
+
+
+def _has(tensors: dict[str, Tensor], key: str, shape: torch.Size) -> bool:
+    levels = tensors.get(f"{key}.int8")
+    return tensors[key].shape == shape if key in tensors else levels is not None and levels.numel() == shape.numel()
 
 
 def _unpacked(tensors: dict[str, Tensor], key: str, shape: torch.Size) -> Tensor:

@@ -32,8 +32,11 @@ SPARE_CORES = 3  # that each training process keeps
 VALIDATION_WORKERS = 2  # that make validation trajectories
 
 
-def run(recipe, state: Path, out: Path, *, minutes: float, device: str, workers: int, about: dict, is_last: bool):
-    """One run of a tools.release.recipes.Recipe, with ``workers`` data workers for each process that trains.
+def run(
+    recipe, state: Path, out: Path, *, minutes: float, device: str, workers: int, about: dict, is_last: bool, first: str
+):
+    """One run of a tools.release.recipes.Recipe, with ``workers`` data workers for each process that trains; where it
+    has no state yet, it begins with that of the run ``first``, if that is not "".
 
     Raises:
         InputError: the state in ``state`` is broken or of another recipe, or the time is too short.
@@ -47,7 +50,7 @@ def run(recipe, state: Path, out: Path, *, minutes: float, device: str, workers:
 
     from gsim3d.train.processes import joined
     from tools.release.runs import RunTrainer, train
-    from tools.release.state import load_into, load_progress
+    from tools.release.state import begun_with, load_into
     from tools.release.trajectories import DataWorkers, TrajectoryStore
 
     world, name = recipe.stream(), recipe.name
@@ -55,14 +58,14 @@ def run(recipe, state: Path, out: Path, *, minutes: float, device: str, workers:
     with folder as scratch, joined(device) as together, ExitStack() as ended:
         report = say if together.is_first else lambda _: None
         store = TrajectoryStore(world, recipe.capacity, device)
-        first = load_progress(state, name).next_trajectory
+        source, progress = begun_with(state, name, first)
         validation = Path(scratch) / "validation"
         maker = make_validation(recipe, validation) if together.is_first else None
         for ends_it in (maker.join, maker.terminate) if maker else ():  # the last one first
             ended.callback(ends_it)
-        with DataWorkers(world, store, first, workers, scratch, together) as made:
+        with DataWorkers(world, store, progress.next_trajectory, workers, scratch, together) as made:
             trainer = RunTrainer(recipe.train, store, Path(scratch) / "run", device, together)
-            progress = load_into(trainer, state, name)
+            load_into(trainer, state, source, differs=source != name)
             report(f"{name}: waits for {recipe.n_first} trajectories of {workers} data workers")
             if not made.wait_for(-(-recipe.n_first // together.count), end - time.monotonic()):
                 raise InputError(f"--minutes: {minutes:g} pass before {recipe.n_first} trajectories are made")
@@ -77,6 +80,7 @@ def run(recipe, state: Path, out: Path, *, minutes: float, device: str, workers:
                 "seconds_before": waited,
                 "seed": world.seed,
                 "is_last": is_last,
+                **({"began_with": {"name": source, "step": progress.step}} if source != name else {}),
                 "new_parameters": trainer.new_parameters,
             }
             given = {"end": end, "out": out, "name": name, "is_last": is_last, "say": report}
@@ -153,6 +157,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cuda")
     parser.add_argument("--workers", type=int, help="data workers (default: all cores but three for each GPU)")
     parser.add_argument("--last", action="store_true", help="the learning rate falls: the last run of a simulator")
+    parser.add_argument("--begin-with", metavar="ARM", help="whose state is taken where the own arm has none")
     parser.add_argument("--commit", default="", help="of the code that runs, for the state")
     args = parser.parse_args(arguments)
     if not args.minutes > 0:
@@ -162,8 +167,8 @@ def main(arguments: list[str] | None = None) -> None:
     together = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     workers = args.workers or len(os.sched_getaffinity(0)) - SPARE_CORES * together
     options = {"minutes": args.minutes, "device": args.device, "workers": max(1, workers // together)}
-    about = {"commit": args.commit}
-    run(recipe(args.world, args.arm), args.state, args.out, about=about, is_last=args.last, **options)
+    options |= {"first": f"{args.world}-{args.begin_with}" if args.begin_with else "", "is_last": args.last}
+    run(recipe(args.world, args.arm), args.state, args.out, about={"commit": args.commit}, **options)
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from gsim3d.viewer.clips import clip_frames
 
 SHOWN = 3  # trajectories in the video
 METRICS = ("psnr_masked", "psnr_body")
+GIVEN = 4  # steps before the predicted ones; a model of fewer is given the last of them
 
 
 def validate(weights: Path, folders: Sequence[Path], device: str) -> tuple[dict, Restored, list[Scene]]:
@@ -30,9 +31,10 @@ def validate(weights: Path, folders: Sequence[Path], device: str) -> tuple[dict,
     restored = restore(weights, device)
     scenes = [restored.open_scene(folder) for folder in folders]
     n_encoded, views = restored.data.history, [default_views(restored, scene) for scene in scenes]
-    n_future, values = min(scene.n_steps for scene in scenes) - n_encoded, {}
+    start, values = max(0, GIVEN - n_encoded), {}
+    n_future = min(scene.n_steps for scene in scenes) - n_encoded - start
     given = {"n_encoded": n_encoded, "n_future": n_future, "metrics": METRICS, "methods": ("model", "constant")}
-    for scores in score_scenes(restored, scenes, views, **given):
+    for scores in score_scenes(restored, scenes, views, start=start, **given):
         masked, body = (scores.values["model"][metric] for metric in METRICS)
         held = scores.values["constant"]["psnr_masked"]
         parts = masked[:n_encoded], masked[n_encoded:], body[n_encoded:], held
