@@ -276,7 +276,7 @@ def model_names() -> list[str]:
 
 
 def model(name: str) -> str:
-    """The model card, the curves, and the scores of all methods."""
+    """The model card, the scores of all methods, the curves, and the edits that docs/make_edits.py measured."""
     from gsim3d import pretrained
     from gsim3d.evaluate.report import markdown
 
@@ -284,9 +284,23 @@ def model(name: str) -> str:
     scores, recipe = (json.loads((folder / f"{part}.json").read_text()) for part in ("scores", "recipe"))
     card = (folder / "README.md").read_text()
     parts = [card, "## Scores of all methods\n", markdown(scores["held_out"], recipe["world"]["world"])]
+    place = RESULTS / "models"
     for picture, text in ((f"{name}.png", "Scores by step"), (f"{name}-frames.png", "Truth above prediction")):
-        if (RESULTS / "models" / picture).is_file():
+        if (place / picture).is_file():
             parts.append(f"![{text}]({picture})\n")
+    if history := recipe.get("scores"):
+        rows = [
+            [f"{e['windows']:,}", *(f"{e[s]:.2f}" for s in ("past", "future", "body", "constant"))] for e in history
+        ]
+        parts += ["## Scores on the way\n", table(("windows", "given steps", "future", "bodies", "constant"), rows)]
+        parts.append(f"Validation trajectories, masked PSNR in dB.\n\n![Scores against windows]({name}-windows.png)\n")
+    if (edits := place / f"{name}.edits.json").is_file():
+        content = json.loads(edits.read_text())
+        old = "" if content["checkpoint"] == scores["checkpoint"] else "Measured with earlier weights.\n\n"
+        parts.append(
+            f"## Edits of encoded particles\n\n{old}{content['table']}\n\nMade by `python docs/make_edits.py`.\n"
+        )
+        parts += [f"![{picture.stem}]({picture.name})\n" for picture in sorted(place.glob(f"{name}-edits-*.png"))]
     return "\n".join(parts)
 
 

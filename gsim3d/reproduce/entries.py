@@ -152,12 +152,12 @@ def edit(case: Case) -> dict:
         points[name] = moving_points(prediction.particles, range(n_given, n_given + n_future))
         if operation is None:
             heights = [moving_points(prediction.particles, [step])[0, :, 2].mean().item() for step in range(n_given)]
-    figure = _strip(rows, [f"+{(step - n_given + 1) / scene.fps:.2f} s" for step in steps])
+    figure = strip(rows, [f"+{(step - n_given + 1) / scene.fps:.2f} s" for step in steps])
     save_figure(figure, with_parents(case.figure))
-    return {"numbers": _of_edits(points, heights, scene.fps), "figure": case.figure.name}
+    return {"numbers": numbers_of_edits(points, heights, scene.fps), "figure": case.figure.name}
 
 
-def _of_edits(points: Mapping[str, Tensor], heights: Sequence[float], fps: float) -> dict[str, float]:
+def numbers_of_edits(points: Mapping[str, Tensor], heights: Sequence[float], fps: float) -> dict[str, float]:
     """The numbers of :func:`edit`: ``points`` [S, N, 3] of each edit, ``heights`` of the body at the given steps."""
     alone, copied, falling, raised = (
         points[name] for name in ("as it is", "duplicated", "ground removed", "ground raised")
@@ -173,7 +173,7 @@ def _of_edits(points: Mapping[str, Tensor], heights: Sequence[float], fps: float
     return {name: value for name, value in found.items() if value is not None}
 
 
-def _strip(rows: Mapping[str, np.ndarray], times: Sequence[str]):
+def strip(rows: Mapping[str, np.ndarray], times: Sequence[str]):
     """Returns a figure of images [S, H, W, 3] by row, with the ``times`` of columns."""
     size = (1.6 * len(times), 1.6 * len(rows))
     figure, panels = pyplot().subplots(len(rows), len(times), figsize=size, squeeze=False, layout="constrained")

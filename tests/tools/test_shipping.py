@@ -56,7 +56,10 @@ def scored(tmp_path_factory, one_thread):
         trainer.train_step()
     this = {"device": "cpu", "trajectories": 1, "steps": [0, 2], "seed": 4321}
     curve = [[step, 1, 0.5, 0.1, 20.0, math.nan, 1e-4] for step in range(2)]
-    save_state(trainer, out / "state", RUN, Progress(next_trajectory=1, runs=[this], curve=curve))
+    scores = [
+        {"windows": n, "past": 20.0, "future": 15.0 + n, "body": 9.0, "constant": 14.0, "scenes": {}} for n in (1, 2)
+    ]
+    save_state(trainer, out / "state", RUN, Progress(next_trajectory=1, runs=[this], curve=curve, scores=scores))
     given = {"device": "cpu", "counts": (2, 1), "changes": {**OPTIONS, "objects": ("ball",)}}
     score.score(weights_file(out / "state", RUN), NAME, out / "trajectories", out / "scores", **given)
     return out
@@ -117,7 +120,11 @@ def test_state_becomes_simulator_with_card(scored, package, tmp_path):
     scores = json.loads((folder / "scores.json").read_text())
     assert "## Limitations\n\n- It floats.\n\n## Licence" in text and "--seed 4321" in text
     assert "- Dynamics: point transformer, " in text
-    assert f"{scores['unseen']['future.psnr_masked']:.2f}" in text
+    assert f"{scores['unseen']['future.psnr_masked']:.2f}" in text and "2 optimizer steps (0 windows)" in text
+    assert f"| {scores['held_out']['past.psnr_masked']:.2f} | " in text
+    kept = json.loads((folder / "recipe.json").read_text())["scores"]
+    assert [entry["future"] for entry in kept] == [16.0, 17.0] and "scenes" not in kept[0]
+    assert (tmp_path / f"{NAME}-windows.png").read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / f"{NAME}.png").is_file() and (tmp_path / f"{NAME}-frames.png").is_file()
     package.main([NAME, *paths])  # keeps the limitations
     assert (folder / "README.md").read_text() == text

@@ -25,12 +25,13 @@ sys.path.insert(0, str(ROOT))
 import gsim3d  # noqa: E402
 from gsim3d import pretrained  # noqa: E402
 from gsim3d.errors import InputError  # noqa: E402
-from gsim3d.evaluate.pictures import write_curves  # noqa: E402
+from gsim3d.evaluate.pictures import pyplot, save_figure, write_curves  # noqa: E402
 from gsim3d.io import checkpoint  # noqa: E402
 from gsim3d.numerics.speed import SPEEDS_FILE  # noqa: E402
 from gsim3d.numerics.trust import TRUST_FILE  # noqa: E402
 from gsim3d.synth.worlds import VALIDATION_SEED  # noqa: E402
 from gsim3d.train.restore import model_config  # noqa: E402
+from tools.release.curve import SCORES  # noqa: E402
 from tools.release.recipes import Recipe, recipe  # noqa: E402
 from tools.release.state import CURVE, load_progress, weights_file  # noqa: E402
 
@@ -75,6 +76,7 @@ def ship(name: str, made: Recipe, state: Path, scores: Path, limitations: str) -
         "training_seconds": progress.seconds,
         "skipped_steps": progress.n_skipped,
         "windows": progress.windows,
+        "scores": [{key: entry[key] for key in ("windows", *SCORES)} for entry in progress.scores],
         "runs": progress.runs,
         "trajectories_begun": progress.next_trajectory,
         "world": {"world": made.world, "preset": made.preset, **dataclasses.asdict(world)},
@@ -133,7 +135,7 @@ simulator = Simulator.from_pretrained("{name}")
 - Data: {used:,} trajectories of {world["n_frames"]} steps and {world["n_cams"]} cameras, each used once, from
   `gsim3d generate {world["world"]} --preset {world["preset"]} --seed {world["seed"]}`{changed}.
   Supervision: images alone.
-- Compute: {recipe["steps"]:,} optimizer steps in {recipe["training_seconds"]:,.0f} s,
+- Compute: {recipe["steps"]:,} optimizer steps ({recipe["windows"]:,} windows) in {recipe["training_seconds"]:,.0f} s,
   {n_runs} run{"s" if n_runs > 1 else ""}, {" and ".join(devices)}; {recipe["skipped_steps"]} steps
   skipped.{before}{put}
 - Weights: averaged, bfloat16. Settings: `config.yaml`; log: `training.jsonl`; data: `recipe.json`.
@@ -142,8 +144,8 @@ simulator = Simulator.from_pretrained("{name}")
 
 {score_table(scores)}
 
-PSNR in dB; masked: without background. {n_scored} held-out trajectories, seed {recipe["held_out_seed"]}. All numbers:
-`scores.json`.
+PSNR in dB; masked: without background, as given steps, bodies and baselines are. {n_scored}
+held-out trajectories, seed {recipe["held_out_seed"]}. All numbers: `scores.json`.
 
 {LIMITATIONS}{limitations.strip()}{LICENCE}
 Apache-2.0. gsim3d {gsim3d.__version__}, sha256 of the weights {scores["checkpoint"][:16]}.
@@ -153,14 +155,15 @@ Apache-2.0. gsim3d {gsim3d.__version__}, sha256 of the weights {scores["checkpoi
 def score_table(scores: dict) -> str:
     """A row for each set: the model beside its baselines."""
     lines = [
-        "| trajectories | steps | masked PSNR | constant | copy | constant velocity | PSNR | SSIM |",
-        "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
+        "| trajectories | steps | given | masked PSNR | bodies | constant | copy | constant velocity | PSNR | SSIM |",
+        "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
     ]
     for subset, what in SETS.items():
         if subset in scores:
             s = scores[subset]
-            masked = [s[f"{method}future.psnr_masked"] for method in ("", "constant.", "copy.", "constant_velocity.")]
-            numbers = " | ".join(f"{value:.2f}" for value in (*masked, s["future.psnr"]))
+            still = [s[f"{method}.future.psnr_masked"] for method in ("constant", "copy", "constant_velocity")]
+            own = s["past.psnr_masked"], s["future.psnr_masked"], s["future.psnr_body"]
+            numbers = " | ".join(f"{value:.2f}" for value in (*own, *still, s["future.psnr"]))
             lines.append(f"| {what} ({s['n_scenes']}) | {s['n_future_steps']} | {numbers} | {s['future.ssim']:.3f} |")
     return "\n".join(lines)
 
@@ -181,12 +184,25 @@ def with_invariances(card: str, name: str) -> str:
     return f"{head}\n\n{INVARIANCES}{said}\n\n{table}\n\n{LIMITATIONS}{rest}"
 
 
+def draw_windows(path: Path, scores: list[dict]) -> None:
+    """Draws the validation scores on the way of a run."""
+    figure, axes = pyplot().subplots(figsize=(6, 3.8), layout="constrained")
+    for score, label in zip(SCORES, ("given steps", "future", "bodies", "constant"), strict=True):
+        axes.plot([entry["windows"] for entry in scores], [entry[score] for entry in scores], ".-", label=label)
+    axes.set(xlabel="training windows", ylabel="masked PSNR of validation trajectories, dB")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    save_figure(figure, path)
+
+
 def update_cards() -> None:
     """Writes the invariances into all cards, and the curves of the scores into the documentation."""
     for name in pretrained.names():
         folder = pretrained.FOLDER / name
         scores, recipe = (json.loads((folder / f"{part}.json").read_text()) for part in ("scores", "recipe"))
         write_curves(PICTURES / f"{name}.png", scores["held_out"], recipe["world"]["fps"], CURVES)
+        if recipe.get("scores"):
+            draw_windows(PICTURES / f"{name}-windows.png", recipe["scores"])
         readme = folder / "README.md"
         readme.write_text(with_invariances(readme.read_text(), name))
 
