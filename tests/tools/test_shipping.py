@@ -144,3 +144,22 @@ def test_scores_of_other_weights_are_refused(scored, package, tmp_path):
     with pytest.raises(InputError, match="of other weights"):
         package.ship(NAME, MADE, scored / "state", tmp_path, "")
     assert pretrained.names() == []
+
+
+def test_violated_laws_come_from_reports(scored, package, tmp_path):
+    (tmp_path / "limitations.md").write_text("- It floats.\n")
+    paths = ["--state", str(scored / "state"), "--scores", str(scored / "scores")]
+    package.main([NAME, *paths, "--limitations", str(tmp_path / "limitations.md")])
+    for number, error in enumerate((0.51234, 0.2)):
+        failures = [{"what": "encode means", "error": error, "bound": 1e-4, "where": "camera 0"}]
+        findings = [{"check": "translate", "failures": failures}, {"check": "other", "failures": failures}]
+        (tmp_path / str(number)).mkdir()
+        (tmp_path / str(number) / "report.json").write_text(json.dumps({"findings": findings}))
+    package.main([NAME, "--laws", str(tmp_path / "1"), str(tmp_path / "0")])
+    folder = pretrained.FOLDER / NAME
+    found = json.loads((folder / pretrained.LAWS).read_text())
+    assert found == {"translate": {"what": "encode means", "error": 0.512, "bound": 1e-4}}
+    assert "| translate | encode means | 0.512 | 0.0001 |" in (folder / "README.md").read_text()
+    (tmp_path / "1" / "report.json").write_text(json.dumps({"findings": []}))
+    package.main([NAME, "--laws", str(tmp_path / "1")])
+    assert not (folder / pretrained.LAWS).exists() and "translate" not in (folder / "README.md").read_text()

@@ -5,6 +5,9 @@
     python tools/release/score.py elastic-small --checkpoint runs/elastic/elastic-velocity.weights.safetensors \
         --data runs/held_out --out runs/scores
     python tools/release/ship_model.py elastic-small --state runs/elastic --scores runs/scores --limitations LIST.md
+    gsim3d doctor --stability elastic-small DATA --out runs/laws
+    gsim3d doctor --stability elastic-small DATA --full --out runs/laws-full
+    python tools/release/ship_model.py elastic-small --laws runs/laws runs/laws-full
     python tools/release/ship_model.py      # updates the invariances in all cards, and the curves in docs/results
 
 LIST.md has 3 to 5 points, seen in the predicted videos; later calls keep the list of the card.
@@ -30,6 +33,7 @@ from gsim3d.io import checkpoint  # noqa: E402
 from gsim3d.numerics.speed import SPEEDS_FILE  # noqa: E402
 from gsim3d.numerics.trust import TRUST_FILE  # noqa: E402
 from gsim3d.synth.worlds import VALIDATION_SEED  # noqa: E402
+from gsim3d.testing.invariances import INVARIANCES  # noqa: E402
 from gsim3d.train.restore import model_config  # noqa: E402
 from tools.release.curve import SCORES  # noqa: E402
 from tools.release.recipes import Recipe, recipe  # noqa: E402
@@ -45,7 +49,7 @@ SETS = {
     "no-ground": "no ground",
     "raised": "raised ground",
 }
-INVARIANCES, LIMITATIONS = "### Invariances that it violates\n\n", "## Limitations\n\n"
+VIOLATED, LIMITATIONS = "### Invariances that it violates\n\n", "## Limitations\n\n"
 LICENCE = "\n\n## Licence and version\n"
 
 
@@ -171,7 +175,7 @@ def score_table(scores: dict) -> str:
 def with_invariances(card: str, name: str) -> str:
     """The model card with a table of laws.json, where the model violates invariances."""
     head, rest = card.split(LIMITATIONS)
-    head = head.split(INVARIANCES)[0].rstrip()
+    head = head.split(VIOLATED)[0].rstrip()
     broken = pretrained.known_failures(pretrained.FOLDER / name / pretrained.WEIGHTS)
     if not broken:
         return f"{head}\n\n{LIMITATIONS}{rest}"
@@ -181,7 +185,21 @@ def with_invariances(card: str, name: str) -> str:
     )
     said = f"Largest errors of `gsim3d doctor --stability {name} DATA`, sampled and with `--full`, on two scenes:"
     table = f"| invariance | quantity | error | allowed |\n| --- | --- | ---: | ---: |\n{rows}"
-    return f"{head}\n\n{INVARIANCES}{said}\n\n{table}\n\n{LIMITATIONS}{rest}"
+    return f"{head}\n\n{VIOLATED}{said}\n\n{table}\n\n{LIMITATIONS}{rest}"
+
+
+def keep_laws(name: str, reports: list[Path]) -> None:
+    """Writes laws.json: the worst error of each invariance that `gsim3d doctor --stability` found violated."""
+    worst: dict[str, dict] = {}
+    for report in reports:
+        for finding in json.loads((report / "report.json").read_text())["findings"]:
+            for found in finding["failures"] if finding["check"] in INVARIANCES else ():
+                if found["error"] > worst.get(finding["check"], {"error": 0.0})["error"]:
+                    error = float(f"{found['error']:.3g}")
+                    worst[finding["check"]] = {"what": found["what"], "error": error, "bound": found["bound"]}
+    (pretrained.FOLDER / name / pretrained.LAWS).unlink(missing_ok=True)
+    if worst:
+        (pretrained.FOLDER / name / pretrained.LAWS).write_text(json.dumps(worst, indent=1) + "\n")
 
 
 def draw_windows(path: Path, scores: list[dict]) -> None:
@@ -213,9 +231,10 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--arm", default="velocity", help="of the recipe (default: velocity)")
     parser.add_argument("--state", type=Path, help="what tools/release/train.py wrote")
     parser.add_argument("--scores", type=Path, help="what score.py wrote")
+    parser.add_argument("--laws", type=Path, nargs="+", metavar="DIR", help="what gsim3d doctor --stability wrote")
     parser.add_argument("--limitations", type=Path, help="markdown list (default: that of the present card)")
     args = parser.parse_args(arguments)
-    if args.name:
+    if args.name and args.state:
         known = pretrained.FOLDER / args.name / "README.md"
         if args.limitations is None and not known.is_file():
             raise InputError("--limitations is needed: a list of what is wrong in the predicted videos")
@@ -223,6 +242,8 @@ def main(arguments: list[str] | None = None) -> None:
         limitations = args.limitations.read_text() if args.limitations else text
         made = recipe(args.name.split("-")[0], args.arm)
         print(f"written: {ship(args.name, made, args.state, args.scores, limitations)}")
+    if args.laws:
+        keep_laws(args.name, args.laws)
     update_cards()
 
 
