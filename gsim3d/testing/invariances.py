@@ -29,7 +29,8 @@ BOUND = 1e-4  # error over the largest value, for float32 sums in another order;
 VELOCITY_BOUND = 1e-3  # for velocities fitted to images of noise; worst seen 2.9e-4
 IMAGE_BOUND = 1e-3  # RMS error of an image: a splat whose alpha crosses 1/255 changes a pixel by 0.004
 GRAIN = 2.0**-18  # metres; positions are rounded to it before a translation, which is then exact in float32
-FROM_POSITIONS = (*attributes_of("point"), "velocity", "irradiance_gain", "light_occlusion")  # depend on positions
+VELOCITIES = attributes_of("vector")
+FROM_POSITIONS = (*attributes_of("point"), *VELOCITIES, "irradiance_gain", "light_occlusion")  # depend on positions
 FAR = 2.0**17  # cells, outside the 2^16 cells of a grid
 
 
@@ -95,7 +96,7 @@ def compare_particles(
     """Deviations of all floating-point attributes, or of those in ``names``."""
     for name, value in expected.row_fields().items():
         if value.is_floating_point() and (not names or name in names):
-            most = VELOCITY_BOUND if bound == BOUND and name == "velocity" else bound
+            most = VELOCITY_BOUND if bound == BOUND and name in VELOCITIES else bound
             yield compare(f"{what} {name}", getattr(actual, name), value, most, lambda i: particle_name(expected, i))
 
 
@@ -321,8 +322,7 @@ def permute_particles(simulator: Simulator, sample: Sample) -> Iterator[Deviatio
 @torch.no_grad()
 def permute_views(simulator: Simulator, sample: Sample) -> Iterator[Deviation]:
     """A permutation of the input views keeps the particles; one of the target cameras permutes the images."""
-    frames = sample.frames
-    n_images = len(frames.cameras)
+    frames, n_images = sample.frames, len(sample.frames.cameras)
     reverse = torch.arange(n_images - 1, -1, -1, device=frames.images.device)
     backwards = select_images(frames, reverse)
     state, other = simulator.encode(frames), simulator.encode(backwards)
@@ -416,7 +416,7 @@ def _with_far_particle(state: Particles, far: float) -> Particles:
         grown,
         means=grown.means + far * is_copy[:, None],
         activity=grown.activity.masked_fill(is_copy, DYNAMIC),
-        velocity=None if grown.velocity is None else grown.velocity * ~is_copy[:, None],
+        **{name: value * ~is_copy[:, None] for name in VELOCITIES if (value := getattr(grown, name)) is not None},
     )
 
 

@@ -13,6 +13,7 @@ from gsim3d.priors import (
     ProximityConfig,
     SegmentationConfig,
     ShapeMatchingConfig,
+    VelocityConfig,
     VelocityFromImagesConfig,
 )
 from gsim3d.simulator import Simulator
@@ -34,7 +35,9 @@ EXPLICIT_CONFIG = dataclasses.replace(
 SEEN = VelocityFromImagesConfig(), InertiaConfig(), ShapeMatchingConfig()
 MOVING = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, priors=(*SEEN, OCCLUSION)))
 PUSHED = (SegmentationConfig(), ProximityConfig(), *SEEN, GravityConfig(), ContactConfig(), OCCLUSION)
-CONFIGS = {"latent": CONFIG, "explicit": EXPLICIT_CONFIG, "moving": MOVING}
+CARRIED = (VelocityFromImagesConfig(), VelocityConfig())
+CARRIED = dataclasses.replace(CONFIG, dynamics=dataclasses.replace(CONFIG.dynamics, priors=CARRIED))
+CONFIGS = {"latent": CONFIG, "explicit": EXPLICIT_CONFIG, "moving": MOVING, "carried": CARRIED}
 
 
 def make_sample(device, dtype=torch.float32, n_steps=3, plan=None):
