@@ -8,6 +8,7 @@ It needs pip install 'gsim3d[generate]'; with gsim3d[video] videos are H.264. A 
 
 import argparse
 import dataclasses
+import json
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -46,7 +47,11 @@ from gsim3d.viewer.clips import ACCENT, GAP, WHITE, clip_frames, write_text, wri
 from gsim3d.viewer.export import write_frames  # noqa: E402
 
 Rows = dict[str, np.ndarray]  # label -> images uint8 [S, V, H, W, 3]
-BODY = {"elastic": "star", "cloth": "blob", "rigid": "capsule"}  # world -> what falls
+# preset of the training -> world -> what falls, and what is inserted
+BODY = {
+    "diverse": {"elastic": "star", "cloth": "blob", "rigid": "capsule", "insert": "ball"},
+    "published": {"elastic": "spot", "cloth": "blob", "rigid": "capsule", "insert": "blob"},
+}
 SEED = 11  # of the scenes; none of the seeds of training
 EDITED, EDIT_STEPS, AT = "elastic-small", 56, 6  # simulator, predicted steps and step of the edits
 INSTANTS, TILE, QUALITY = 4, 256, 76  # of a poster: moments, pixels of each, JPEG quality
@@ -68,10 +73,12 @@ def edits(other: Particles | None = None) -> dict[str, Operation]:
 
 
 def scene_of(world: str, out: Path, frames: int | None, body: str | None = None) -> Path:
-    """The folder of a generated scene."""
-    body = body or BODY[world]
+    """The folder of a scene of the preset that the simulator of the world was trained on; ``body``: a key of BODY."""
+    recipe = json.loads((pretrained.FOLDER / f"{world}-small" / "recipe.json").read_text())
+    preset = recipe["world"]["preset"]
+    body = BODY[preset][body or world]
     changes = {} if frames is None else {"n_frames": frames}
-    options = {"preset": "diverse", "seed": SEED, "n_trajectories": 1, "objects": (body,), **changes}
+    options = {"preset": preset, "seed": SEED, "n_trajectories": 1, "objects": (body,), **changes}
     return generate(out / "scenes" / f"{world}-{body}", world, processes=1, progress=False, **options).folders[0]
 
 
@@ -136,7 +143,7 @@ def of_edits(out: Path, frames: int | None) -> Iterator[tuple[str, Callable[[], 
 
         def made(name=name):
             restored, scene, n_future, (prediction, before) = base()
-            other = encode_folder(restored, scene_of("elastic", out, frames, "ball")) if name == "insert" else None
+            other = encode_folder(restored, scene_of("elastic", out, frames, "insert")) if name == "insert" else None
             operation = edits(other)[name]
             _, after, _ = drawn(restored, scene, 1, n_future, Edit(min(AT, n_future - 1), operation))
             return {"as it was": before, name: after}, scene.fps, prediction.n_encoded

@@ -264,13 +264,13 @@ def _mean_and_error(values: np.ndarray) -> list[float | None]:
 
 
 def read_given(text: str) -> dict[str, float]:
-    """Metric -> PSNR in dB of input steps, from a number or a metrics.json of `gsim3d evaluate`. Raises InputError if
-    ``text`` is neither."""
+    """Metric -> PSNR in dB of input steps, from a number, a metrics.json of `gsim3d evaluate` or the scores.json of a
+    shipped simulator. Raises InputError if ``text`` is none of them."""
     try:
         given = {"psnr_masked": float(text)}
     except ValueError:
         try:
-            scores = parse_json(read_file(text, MAX_TEXT))
+            scores = (known := parse_json(read_file(text, MAX_TEXT))).get("held_out", known)
             given = {metric: scores.get(f"past.{metric}") for metric in ("psnr_masked", "psnr_body")}
             given = {metric: float(value) for metric, value in given.items() if value is not None}
         except (OSError, ValueError, TypeError, AttributeError) as error:

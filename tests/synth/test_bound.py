@@ -119,3 +119,10 @@ def test_bound_refuses_other_sets(sets, tmp_path):
     for text in ("nan", "no-file.json", str(tmp_path / "manifest.json")):
         with pytest.raises(InputError, match="--given"):
             read_given(text)
+
+
+def test_given_errors_are_those_of_reports_and_of_shipped_scores(tmp_path):
+    scores = {"past.psnr_masked": 30.0, "past.psnr_body": 20.0}
+    for content in (scores, {"held_out": scores, "name": "elastic-small"}):
+        (tmp_path / "scores.json").write_text(json.dumps(content))
+        assert read_given(str(tmp_path / "scores.json")) == {"psnr_masked": 30.0, "psnr_body": 20.0}
