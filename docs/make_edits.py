@@ -3,10 +3,10 @@
     python tools/release/score.py elastic-small --data runs/held_out --out runs/scores --sets held_out
     python docs/make_edits.py elastic-small runs/held_out/validation/elastic/held_out --out runs/edits --device cuda
 
-Written to OUT: NAME.edits.json; a film and a picture of each of the first scenes, all edits beside each other. Printed:
-the table. A scene that is measured already, with these weights, is not measured again. Shadows are those of generated
-scenes: how much darker the ground is where the lamp and the predicted body want it, over what the renderer casts.
-NAME.edits.json and pictures in docs/results/models are shown on the page of the model.
+Written to OUT: NAME.edits.json with its table, which is printed; a video and a picture of each of the first scenes, all
+edits beside each other. A scene that is measured already, with these weights, is not measured again. Shadows are those
+of generated scenes: how much darker the ground is where the lamp and the predicted body want it, over what the renderer
+casts. NAME.edits.json and pictures in docs/results/models are shown on the page of the model.
 """
 
 import argparse
@@ -82,18 +82,18 @@ def pixels(points: np.ndarray, scene: Scene, cam: int) -> np.ndarray:
 
 
 def measured(restored: Restored, scene: Scene, out: Path | None) -> dict[str, float]:
-    """The numbers of a scene; its film and picture go to ``out``.mp4 and .png."""
+    """The numbers of a scene; its video and picture go to ``out``.mp4 and .png."""
     context, targets = default_views(restored, scene)
     n_given, cam = restored.n_encoded, targets[:1]
     n_future = min(EDIT_STEPS, horizon(scene, n_given, None))
     future = range(n_given, n_given + n_future)
-    films, points, heights = {"truth": true_images(scene, cam, range(future.stop))}, {}, []
+    videos, points, heights = {"truth": true_images(scene, cam, range(future.stop))}, {}, []
     for name, operation in EDITED.items():
         edits = () if operation is None else (Edit(0, operation),)
         spec = dataclasses.replace(restored.plan.spec, structure=structure_of(edits))
         planned = dataclasses.replace(restored, plan=restored.simulator.plan(spec))
         made = predict(planned, scene, context, n_future, edits=edits)
-        films[name] = as_bytes(render_steps(planned, made.particles, scene, cam))
+        videos[name] = as_bytes(render_steps(planned, made.particles, scene, cam))
         points[name] = moving_points(made.particles, future)
         if operation is None:
             heights = [moving_points(made.particles, [step])[0, :, 2].mean().item() for step in range(n_given)]
@@ -101,14 +101,14 @@ def measured(restored: Restored, scene: Scene, out: Path | None) -> dict[str, fl
     for name in LIT if points["as it is"].shape[1] else ():
         level, cast = RAISE * (name == "ground raised"), []
         for step in range(4, n_future, 5):
-            body, image = points[name][step].double().numpy(), films[name][n_given + step, 0]
+            body, image = points[name][step].double().numpy(), videos[name][n_given + step, 0]
             cast.append(darkness(image, body, scene, cam[0], level) / CAST)
         found[f"shadow {name}"] = float(np.mean([value for value in cast if np.isfinite(value)] or [np.nan]))
     if out is not None:
         shown = np.linspace(n_given, future.stop - 1, min(SHOWN, n_future)).round().astype(int).tolist()
         times = [f"+{(step - n_given + 1) / scene.fps:.2f} s" for step in shown]
-        save_figure(strip({name: images[shown, 0] for name, images in films.items()}, times), out.with_suffix(".png"))
-        write_video(out.with_suffix(".mp4"), clip_frames(films, scene.fps, n_given), scene.fps)
+        save_figure(strip({name: images[shown, 0] for name, images in videos.items()}, times), out.with_suffix(".png"))
+        write_video(out.with_suffix(".mp4"), clip_frames(videos, scene.fps, n_given), scene.fps)
     return {name: value for name, value in found.items() if np.isfinite(value)}
 
 
@@ -131,7 +131,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--checkpoint", help="where its weights are (default: those that come with gsim3d)")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--scenes", type=int, help="how many, one body after another (default: all)")
-    parser.add_argument("--films", type=int, default=6, help="of the first scenes, each of another body (default: 6)")
+    parser.add_argument("--videos", type=int, default=6, help="of the first scenes, each of another body (default: 6)")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     args = parser.parse_args(arguments)
     restored, file = restore(args.checkpoint or args.name, args.device), args.out / f"{args.name}.edits.json"
@@ -143,7 +143,7 @@ def main(arguments: list[str] | None = None) -> None:
     for number, folder in enumerate(progress(folders, "scenes", len(folders), unit="scene")):
         name = f"{folder.parent.name}/{folder.name}"
         if name not in scenes:
-            place = args.out / f"{args.name}-edits-{folder.parent.name}" if number < args.films else None
+            place = args.out / f"{args.name}-edits-{folder.parent.name}" if number < args.videos else None
             scenes[name] = measured(restored, restored.open_scene(folder), place)
             write_json(file, {**head, "table": table(scenes), "scenes": scenes})
     print(table(scenes))
