@@ -384,6 +384,7 @@ def test_recipes_are_sound(world, arm):
     made = recipe(world, arm)
     stream, data, phases = made.stream(), made.train.data, made.train.phases
     assert made.name == f"{world}-{arm}" and stream.name == world and made.n_first <= made.capacity
+    assert (data.resize, data.near_far) == ((128, 128), (stream.rig().near, stream.rig().far))
     assert stream.n_frames >= data.history + max(phase.horizon for phase in phases)
     assert made.train.n_steps >= 1_000_000
     model = build_simulator(model_config(made.train), 0).config.dynamics  # raises where switches do not agree
@@ -400,6 +401,7 @@ def test_rows_of_ablations_are_arms():
     made, base = recipe("elastic", "rollout-2"), recipe("elastic")
     assert made.name == "elastic-rollout-2" and made.train.phases[0] == base.train.phases[0]
     assert {phase.horizon for phase in made.train.phases} == {0, 2} and made.train.data == base.train.data
+    assert made.train.data.resize == (128, 128)
     assert model_config(recipe("elastic", "latent").train) == model_config(base.train)
 
 

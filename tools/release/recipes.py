@@ -62,7 +62,10 @@ def recipe(world: str, arm: str = "velocity") -> Recipe:
             raise InputError(f"the world {world} has no priors; choose another arm")
         settings = merged(settings, {"model": {"dynamics": read_yaml(CONFIGS.parent / "priors" / f"{world}.yaml")}})
     train = from_dict(TrainConfig, settings)
-    return Recipe(f"{world}-{arm}", world, changed(train, rows[arm].change) if arm in rows else train)
+    train = changed(train, rows[arm].change) if arm in rows else train
+    rig = Recipe("", world, train).stream().rig()  # to which what is shipped fits images and depth ranges
+    data = dataclasses.replace(train.data, resize=(rig.size, rig.size), near_far=(rig.near, rig.far))
+    return Recipe(f"{world}-{arm}", world, dataclasses.replace(train, data=data))
 
 
 def merged(settings: dict, changes: dict) -> dict:
