@@ -28,7 +28,7 @@ from gsim3d.train.loop import deterministic
 from gsim3d.train.processes import Processes
 from gsim3d.train.restore import build_simulator, model_config, restore
 from gsim3d.train.samples import draw_batch
-from tools.release import curve, recipes, runs
+from tools.release import curve, recipes, runs, validation
 from tools.release.recipes import WORLDS, recipe
 from tools.release.runs import RunTrainer, train
 from tools.release.state import (
@@ -270,6 +270,16 @@ def test_the_weights_are_a_checkpoint(first_run):
     assert restored.image_size == (32, 32) and restored.data == CONFIG.data
     weights = restored.simulator.state_dict()
     assert all(torch.equal(weights[k], v.bfloat16().float()) for k, v in trainer.average.items())
+
+
+def test_a_shorter_history_is_validated_on_the_same_steps(first_run, tmp_path, monkeypatch):
+    _, state, _ = first_run
+    folders = generate(tmp_path / "data", preset="mini", processes=1, progress=False, **OPTIONS).folders
+    asked, real = [], validation.score_scenes
+    monkeypatch.setattr(validation, "score_scenes", lambda *args, **given: asked.append(given) or real(*args, **given))
+    entry, *_ = validation.validate(weights_file(state, NAME), folders, "cpu")
+    assert [(given["start"], given["n_encoded"], given["n_future"]) for given in asked] == [(2, 2, 2)]
+    assert entry["step"] == 3 and all(math.isfinite(value) for value in next(iter(entry["scenes"].values())))
 
 
 def test_a_state_replaces_the_one_before(first_run):
