@@ -53,8 +53,9 @@ def test_shadows_of_the_renderer_are_whole(tmp_path):
     options = {"n_trajectories": 1, "n_frames": 5, "objects": ("capsule",), "processes": 1, "progress": False}
     scene = Scene.open(generate(tmp_path, "elastic", preset="published", **options).folders[0])
     (nodes,) = true_states(scene)
-    centre = nodes[3].double().numpy().mean(0)
-    inner = centre + 0.5 * (nodes[3].double().numpy() - centre)  # nodes lie around the body
+    nodes = nodes[3].double().numpy().reshape(-1, 3)
+    centre = nodes.mean(0)
+    inner = centre + 0.5 * (nodes - centre)  # nodes lie around the body
     image = scene.images([2], [3])[0, 0].permute(1, 2, 0).numpy()
     found = edits.darkness(image, np.repeat(inner, 9, 0), scene, 2, 0.0)
     assert found == pytest.approx(edits.CAST, abs=0.1)

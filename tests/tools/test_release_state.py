@@ -459,7 +459,7 @@ def test_scores_against_windows_are_printed_with_paired_differences(first_run, t
     (tmp_path / "b").mkdir()
     save_state(trainer, tmp_path / "b", "a", done)  # of the same name
     files = state_file(state, "a"), state_file(tmp_path / "b", "a")
-    with pytest.raises(InputError, match="a: no state, or one without scores"):
+    with pytest.raises(InputError, match="no state, or one without scores"):
         curve.main([str(file) for file in files])
     save_state(trainer, tmp_path / "b", "a", dataclasses.replace(done, scores=[entry]))
     curve.main([str(file) for file in files])
