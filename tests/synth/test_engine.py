@@ -257,14 +257,8 @@ def test_states_hold_nodes_that_hardly_move_a_vertex():
 def test_points_bind_to_a_deformed_control_grid(motion):
     grid, vertices = motion
     nodes = embedding.states(grid)
-    assert (
-        abs(
-            np.linalg.norm(nodes[15, 3, 0, 0] - nodes[15, 0, 0, 0])
-            / np.linalg.norm(nodes[0, 3, 0, 0] - nodes[0, 0, 0, 0])
-            - 1
-        )
-        > 0.01
-    )
+    before, after = (np.linalg.norm(nodes[step, 3, 0, 0] - nodes[step, 0, 0, 0]) for step in (0, 15))
+    assert abs(after / before - 1) > 0.01
     for step in (3, 15):
         binding = embedding.bind_deformed(nodes[step], vertices[step])
         np.testing.assert_allclose(binding.move(nodes[step]), vertices[step], atol=1e-6)
