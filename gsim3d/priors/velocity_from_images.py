@@ -64,8 +64,7 @@ class VelocityFromImages(Prior, config=VelocityFromImagesConfig):
             return particles
         gravity = ctx.priors.get("gravity")
         fall = None if gravity is None or ctx.is_empty else gravity.fall(ctx)
-        velocity = estimate_velocity(ctx, frames, self.config, fall)
-        return replace(particles, velocity=velocity)
+        return replace(particles, velocity=estimate_velocity(ctx, frames, self.config, fall))
 
 
 @torch.no_grad()
@@ -100,7 +99,7 @@ def estimate_velocity(
             start = mean_shift(now, then, windows.nodes, config.radius), spans[:, None, None] * spin
             known = (spans > 0) & (now.n > 0) & (then.n > 0)
             per_step = (known / spans.clamp(min=1))[:, None, None].to(now.positions.dtype)
-            velocity, spin = (x * per_step for x in _align(windows, center, *start, seen, before, config))
+            velocity, spin = (x * per_step for x in _align(windows, center, *start, seen, before))
         velocity, spin, pivot = windows.to_particles(velocity, spin, center)
         displacement = -next_displacement(movable.positions, -velocity, -spin, pivot)
         if fall is not None:
@@ -114,16 +113,10 @@ def estimate_velocity(
 
 
 def _align(
-    windows: Windows,
-    center: Tensor,
-    velocity: Tensor,
-    spin: Tensor,
-    seen: _Views,
-    before: _Views,
-    config: VelocityFromImagesConfig,
+    windows: Windows, center: Tensor, velocity: Tensor, spin: Tensor, seen: _Views, before: _Views
 ) -> tuple[Tensor, Tensor]:
     """Refines displacement (m) and spin (rad) of each window since an earlier step, [B, G, 3] each."""
-    now, window = windows.movable.samples, windows.weights
+    now, window, config = windows.movable.samples, windows.weights, seen.config
     outwards = F.normalize(now.positions - windows.to_samples(center)[0], dim=2)
     positions = now.positions + config.inside * outwards
     targets, is_visible = seen.colours(positions)
@@ -184,7 +177,7 @@ class _Views:
         center: Tensor,
         config: VelocityFromImagesConfig,
     ):
-        device, cameras, self._facing = center.device, frames.cameras, config.facing
+        device, cameras, self.config = center.device, frames.cameras, config
         clouds = constant(tuple(chosen), device)
         scenes = constant(tuple(particles.clouds.scenes[q] for q in chosen), device)
         chosen_images = images[clouds]
@@ -205,7 +198,7 @@ class _Views:
     def faces(self, positions: Tensor, outwards: Tensor) -> Tensor:
         """bool [B, V, S]: whether a surface at ``positions`` [B, S, 3] with normals ``outwards`` faces the cameras."""
         towards = F.normalize(self._eyes[:, :, None] - positions[:, None], dim=3)
-        return (towards * outwards[:, None]).sum(3) > self._facing
+        return (towards * outwards[:, None]).sum(3) > self.config.facing
 
     def colours(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """Colours [B, V, S, 3] at ``positions``, and the mask bool [B, V, S] of valid ones."""
