@@ -100,13 +100,17 @@ class Frames(TensorRecord):
     actions: TensorRecord | None = None
     backbone_features: Tensor | None = None
 
-    def subsample(self, background_stride: int, body_stride: int) -> Frames:
+    def subsample(self, background_stride: int, body_stride: int, masks: bool = True) -> Frames:
         """Returns frames with subsampled masks: only every n-th row and column of pixels becomes particles.
 
         Args:
             background_stride: n for pixels of static geometry.
             body_stride: n for pixels of movable bodies.
+            masks: False: all pixels with recorded values are of movable bodies, whatever the labels say.
         """
+        if not masks:
+            whole = torch.ones_like(self.images[:, 0], dtype=torch.bool)
+            self = dataclasses.replace(self, masks=whole if self.valid is None else self.valid, dynamic=whole)
         if background_stride == body_stride == 1 or self.masks is None or self.dynamic is None:
             return self
         of_body, of_background = (_every(n, self.masks) for n in (body_stride, background_stride))
@@ -134,6 +138,7 @@ class InputSpec:
         image_size: (width, height) in pixels.
         near_far: depth range of all scenes in metres; empty: each scene's own.
         fps: frames per second; None if unknown.
+        masks: see :meth:`Frames.subsample`.
     """
 
     history: int = 2
@@ -145,6 +150,7 @@ class InputSpec:
     image_size: tuple[int, ...] = ()
     near_far: tuple[float, ...] = ()
     fps: float | None = None
+    masks: bool = True
 
 
 class FrameSource(Protocol):

@@ -258,7 +258,7 @@ class ModelScenes(Scenes):
             dynamic=segments == render.BODY,
         )
         labels = torch.where(frames.dynamic, labels.long() - render.FIRST_BODY, -1)
-        return frames.subsample(self.inputs.background_stride, self.inputs.body_stride), labels
+        return frames.subsample(self.inputs.background_stride, self.inputs.body_stride, self.inputs.masks), labels
 
     def _gripped(self, particles: Particles, actor: Tensor, started: Mapping[int, Start]) -> Tensor:
         """Actor of each particle [N]; those of bodies in a gripper belong to it."""

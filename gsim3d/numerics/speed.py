@@ -164,7 +164,8 @@ def encode_histories(
     frames, states = frames.to(device), []
     with setting.precision("encoder", device.type):
         for n_steps in range(left_out + 1):
-            some = without_oldest(frames, n_steps).subsample(inputs.background_stride, inputs.body_stride)
+            some = without_oldest(frames, n_steps)
+            some = some.subsample(inputs.background_stride, inputs.body_stride, inputs.masks)
             states.append(setting.retained(simulator.encode(some)))
     check_input(simulator, frames, states[0], names)
     return states

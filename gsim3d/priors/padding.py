@@ -115,7 +115,6 @@ class Samples(Compact):
 
     Attributes:
         n: int64 [B], number of members.
-        known: bool [B, S], False for padding.
         positions: [B, S, 3] in metres, 0 for padding.
         mean: mean position [B, 3].
     """

@@ -79,11 +79,10 @@ def estimate_velocity(
     newest particles in m/step^2, which converts a mean to a final velocity.
     """
     particles, clouds, newest = ctx.history, ctx.history.clouds, ctx.newest
-    result = torch.zeros_like(particles.means)
     steps, histories = clouds.steps, zip([0, *(q + 1 for q in newest)], newest)
     oldest = [next(f for f in range(begin, q + 1) if steps[q] - steps[f] < ctx.max_steps) for begin, q in histories]
     if oldest == newest or ctx.is_empty:
-        return result
+        return torch.zeros_like(particles.means)
     with torch.autocast(particles.means.device.type, enabled=False):
         movable = ctx.movable
         windows = Windows(movable, particles, config.radius, evenly=False)
@@ -106,10 +105,7 @@ def estimate_velocity(
             spans = [steps[q] - steps[f] for f, q in zip(oldest, newest)]
             remaining = constant(tuple(max(0, span - 1) for span in spans), displacement.device)
             displacement = displacement + 0.5 * remaining[:, None, None] * movable.gather(fall)
-        displacement = movable.scatter(displacement)
-    for q, part in zip(newest, displacement.split([clouds.count(q) for q in newest]), strict=True):
-        result[clouds.starts[q] : clouds.starts[q + 1]] = part
-    return result
+        return ctx.scatter_newest(movable.scatter(displacement))
 
 
 def _align(

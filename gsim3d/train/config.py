@@ -67,6 +67,7 @@ class DataConfig:
     #: the background.
     background_stride: int = 1
     body_stride: int = 1  #: every n-th row and column of the pixels of movable bodies becomes a particle
+    masks: bool = True  #: read the labels of input images; if False, all their pixels are of movable bodies
     #: largest fraction, 0 to 1, of a scene's background that is presented to the dynamics as movable, drawn per scene
     #: and in cubes; augmentation for models with an asymmetric background, whose particles at rest may be awake or
     #: asleep

@@ -166,8 +166,8 @@ def spread_views(cameras: Sequence[int], count: int, turn: int) -> tuple[int, ..
 
 
 def subsampled(frames: Frames, data: DataConfig) -> Frames:
-    """Returns ``frames`` with masks subsampled by the strides of ``data``."""
-    return frames.subsample(data.background_stride, data.body_stride)
+    """Returns ``frames`` with the masks and strides of ``data``."""
+    return frames.subsample(data.background_stride, data.body_stride, data.masks)
 
 
 def draw_noise(data: DataConfig, n_context: int, seed: int, step: int, samples: Sequence[int]) -> Tensor | None:

@@ -19,8 +19,9 @@ from gsim3d.evaluate.ablations import (
     rows_named,
     with_steps,
 )  # fmt: skip
+from gsim3d.simulator import Simulator
 from gsim3d.train.captured import check_capturable
-from gsim3d.train.config import DataConfig, OptimizerConfig, PhaseConfig, TrainConfig
+from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, PhaseConfig, TrainConfig
 from gsim3d.train.loop import Trainer
 from gsim3d.train.restore import build_simulator, model_config
 from tests.tiny_scenes import write_scenes
@@ -66,7 +67,8 @@ def test_rows_change_what_they_say():
     assert found["explicit"] == {"encoder", "dynamics", "renderer"}
     assert found["no-tem"] == found["grid-half"] == found["grid-double"] == found["calls-2"] == {"dynamics"}
     assert found["rollout-2"] == {"phases"} and found["history-1"] == found["views-2"] == {"data"}
-    assert found["background-masked"] == {"effects"}
+    assert found["background-masked"] == {"effects"} and found["no-masks"] == {"data"}
+    assert changed(BASES["small"], ROWS["no-masks"].change).loss.body_weight == 0 < base.loss.body_weight
 
 
 def test_grid_rows_scale_the_base():
@@ -161,6 +163,19 @@ def test_rows_of_other_histories_are_scored_over_the_same_steps(folders, tmp_pat
     assert rows["history-1"]["copy.psnr"] == pytest.approx(rows["latent"]["copy.psnr"], abs=1e-9)
     assert rows["history-2"]["same_as"] == "latent" and rows["history-2"]["runs"] == rows["latent"]["runs"]
     assert "same as latent" in markdown(content) and not (tmp_path / "history-2").exists()
+
+
+def test_labels_are_read_neither_in_training_nor_in_scoring(folders, tmp_path, monkeypatch):
+    base, seen = dataclasses.replace(BASE, loss=LossConfig(body_weight=2.0)), []
+    encode = Simulator.encode
+
+    def encoded(self, frames, **options):
+        seen.append((self.training, bool(frames.masks.all() and frames.dynamic.all())))
+        return encode(self, frames, **options)
+
+    monkeypatch.setattr(Simulator, "encode", encoded)
+    (row,) = run(study(folders, "no-masks", base), tmp_path)["rows"]
+    assert set(seen) == {(True, True), (False, True)} and row["psnr_masked"] > 0
 
 
 def test_targets_are_cameras_that_no_row_has_as_input(folders):

@@ -357,7 +357,7 @@ class Ops(TorchDispatchMode):
     "row",
     [
         *("latent", "explicit", "no-tem", "background-masked", "background-dynamic", "calls-2", "relightable"),
-        *("flying", "acting", "graph"),
+        *("no-masks", "flying", "acting", "graph"),
     ],
 )
 def test_captured_ops_have_fixed_sizes(row, scenes, tmp_path):

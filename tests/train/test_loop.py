@@ -312,6 +312,13 @@ def test_subsampling_by_strides(folder):
     share = (sparse.masks & ~frames.dynamic).sum() / ground.sum()
     assert 0.15 < share < 0.35
     assert subsampled(frames, DataConfig()) is frames
+    pixels, valid = torch.ones_like(frames.masks), frames.images[:, 0] > 0.5
+    whole = subsampled(frames, DataConfig(masks=False, background_stride=2))
+    assert torch.equal(whole.masks, pixels) and torch.equal(whole.dynamic, pixels)
+    padded = dataclasses.replace(frames, valid=valid, masks=None, dynamic=None)
+    assert torch.equal(subsampled(padded, DataConfig(masks=False)).masks, valid)
+    every = subsampled(frames, DataConfig(masks=False, background_stride=8, body_stride=2)).masks
+    assert every.sum() == pixels.sum() / 4
     of_body = subsampled(frames, DataConfig(body_stride=2)).masks
     assert torch.equal(of_body & ~frames.dynamic, ground) and 0.1 < (of_body & body).sum() / body.sum() < 0.4
 

@@ -30,6 +30,7 @@ from gsim3d.state import last_steps  # noqa: E402
 from gsim3d.synth.render import FIRST_BODY  # noqa: E402
 from gsim3d.synth.writer import FILE_TEMPLATE  # noqa: E402
 from gsim3d.train.restore import Restored, restore  # noqa: E402
+from gsim3d.train.samples import subsampled  # noqa: E402
 
 LEAST = 8  # particles of a body; others are left out
 
@@ -48,7 +49,7 @@ def scene_errors(restored: Restored, scene: Scene) -> dict[str, float] | None:
     moved = np.linalg.norm(last - first, axis=1)
     body = int(moved.argmax())
     frames = input_frames(restored, [scene], [context])
-    frames = frames.subsample(simulator.inputs.background_stride, simulator.inputs.body_stride).to(restored.device)
+    frames = subsampled(frames, restored.data).to(restored.device)
     with torch.no_grad():
         state = simulator.encode(frames)
     shown = torch.from_numpy(_instances(scene, context, n_encoded)).to(restored.device)
