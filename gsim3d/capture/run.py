@@ -27,7 +27,6 @@ from gsim3d.data.videos import FILE
 from gsim3d.errors import InputError
 from gsim3d.evaluate.protocol import score_scene
 from gsim3d.io.files import sha256_of, write_whole
-from gsim3d.io.locks import only_one_writer
 from gsim3d.io.settings import from_dict, to_dict
 from gsim3d.nn.multiview_encoder.config import ViTConfig
 from gsim3d.pretrained.loading import check_device
@@ -35,7 +34,7 @@ from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, PhaseCo
 from gsim3d.train.log import LOG
 from gsim3d.train.loop import Trainer
 from gsim3d.train.restore import restore
-from gsim3d.train.run import train
+from gsim3d.train.run import run_folder, train
 
 PHASES = ((0, 0.35, 2e-3), (3, 0.25, 1e-3), (12, 0.4, 1e-3))  # horizon, share of the time, learning rate
 DEPTH_RATE = 0.15  # learning rate of a pretrained encoder, relative to the other parts
@@ -83,16 +82,13 @@ def capture(
     folder, out = Path(folder), Path(out)
     if not folder.is_dir():
         raise InputError(f"{folder} is not a folder")
-    if out.exists() and not out.is_dir():
-        raise InputError(f"--out: {out} is not a folder")
     check_device(device)
     if depth:
         ViTConfig(depth[0])  # raises if there is no such model
         if not Path(depth[1]).is_file():
             raise InputError(f"--depth: {depth[1]}: no such file")
         depth = depth[0], str(Path(depth[1]).resolve())
-    out.mkdir(parents=True, exist_ok=True)
-    with only_one_writer(out):
+    with run_folder(out):
         run = _Run(folder, out, device, minutes, depth, force, say)
         run.check_same()
         run.calibrate(board, scale)

@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     from gsim3d.data import find_scenes
     from gsim3d.errors import InputError
     from gsim3d.evaluate.ablations import PAPER, Study, base_run, load_ablations, markdown, rows_named
-    from gsim3d.io.locks import only_one_writer
+    from gsim3d.train.run import run_folder
 
     bases, rows = load_ablations(PAPER if args.table is None else Path(args.table))
     if args.list:
@@ -59,13 +59,10 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"{'DATA' if args.data is None else '--out'} is required (see gsim3d ablate --help)")
     chosen = rows_named(args.rows, rows)
     base, out = base_run(bases, args.preset, args.config, args.steps), Path(args.out)
-    if out.exists() and not out.is_dir():
-        raise InputError(f"--out: {out} is not a folder")
     study = Study(base, chosen, find_scenes(args.data), n_seeds=args.seeds, device=args.device)
     command = shlex.join(["gsim3d", "ablate", *sys.argv[2:]])
     limits = {"together": args.together, "minutes": math.inf if args.minutes is None else args.minutes}
-    out.mkdir(parents=True, exist_ok=True)
-    with only_one_writer(out):
+    with run_folder(out):
         content = study.run(out, command, **limits, progress=not args.quiet, say=partial(print, flush=True))
     print(markdown(content), f"written: {out / 'ablation.md'}, {out / 'ablation.json'}", sep="\n")
     return 1 if any("failure" in run for row in content["rows"] for run in row["runs"]) else 0

@@ -12,18 +12,17 @@ from typing import Any
 import numpy as np
 
 from gsim3d.data import Scene, split_scenes
-from gsim3d.errors import InputError
 from gsim3d.evaluate import pictures
 from gsim3d.evaluate.protocol import Prediction, default_views, predict, render_steps, score_scene
 from gsim3d.evaluate.report import summarize, table, write_json
 from gsim3d.io import checkpoint, write_video
-from gsim3d.io.locks import only_one_writer
 from gsim3d.io.terminal import progress as shown
 from gsim3d.synth import generate
 from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, PhaseConfig, TrainConfig
 from gsim3d.train.log import memory_gib
 from gsim3d.train.loop import Trainer
 from gsim3d.train.restore import restore
+from gsim3d.train.run import run_folder
 from gsim3d.viewer.clips import clip_frames
 
 _phase = partial(PhaseConfig, batch=2, target_views=2, warm_up=0.1)
@@ -66,12 +65,8 @@ def run_demo(out: str | Path, config: DemoConfig | None = None, *, progress: boo
         InputError: ``out`` is not a folder or contains a run with other settings, or a package is missing.
     """
     config = config or DemoConfig()
-    out = Path(out)
-    if out.exists() and not out.is_dir():
-        raise InputError(f"--out: {out} is not a folder")
-    start = time.perf_counter()
-    out.mkdir(parents=True, exist_ok=True)
-    with only_one_writer(out):
+    out, start = Path(out), time.perf_counter()
+    with run_folder(out):
         return _run(out, config, progress, start)
 
 

@@ -18,7 +18,6 @@ from gsim3d.evaluate.pictures import pyplot
 from gsim3d.evaluate.report import write_json
 from gsim3d.evaluate.scoring import METRICS, measurable
 from gsim3d.io.files import write_whole
-from gsim3d.io.locks import only_one_writer
 from gsim3d.io.machine import machine
 from gsim3d.io.terminal import in_columns
 from gsim3d.numerics.speed import SPEEDS_FILE
@@ -30,6 +29,7 @@ from gsim3d.profile.timing import SECTIONS, Timing
 from gsim3d.synth.run import generate
 from gsim3d.synth.worlds import WORLDS
 from gsim3d.train.restore import Restored, restore
+from gsim3d.train.run import run_folder
 
 FORMAT = 3
 BATCH = 4  # scenes in the batch of the throughput
@@ -98,13 +98,10 @@ def profile(
         measured = tuple(name for name in measured if name not in slow)
     pyplot()
     restored = restore(checkpoint, device)
-    if out.exists() and not out.is_dir():
-        raise InputError(f"--out: {out} is not a folder")
-    if data is None:
-        data, scenes = generated(checkpoint, restored, out / "scenes", effort.n_steps or FULL_STEPS), "all"
-    case = BenchmarkCase(restored, _scenes(restored, data, scenes, effort.n_scenes), effort.n_steps, measured)
-    out.mkdir(parents=True, exist_ok=True)
-    with only_one_writer(out):
+    with run_folder(out):
+        if data is None:
+            data, scenes = generated(checkpoint, restored, out / "scenes", effort.n_steps or FULL_STEPS), "all"
+        case = BenchmarkCase(restored, _scenes(restored, data, scenes, effort.n_scenes), effort.n_steps, measured)
         sweep = Sweep(case, effort, limit, progress, out / "measured.json")
         points, not_run = sweep.points(groups)
         sweep.run(points)

@@ -19,7 +19,6 @@ from gsim3d.evaluate.pictures import pyplot
 from gsim3d.evaluate.protocol import default_views
 from gsim3d.evaluate.scoring import measurable
 from gsim3d.io.files import output_path, sha256_of
-from gsim3d.io.locks import only_one_writer
 from gsim3d.io.machine import machine
 from gsim3d.io.settings import to_dict
 from gsim3d.reproduce import page
@@ -31,6 +30,7 @@ from gsim3d.synth.worlds import build_world
 from gsim3d.synth.writer import scene_folder
 from gsim3d.train.config import TrainConfig
 from gsim3d.train.restore import Restored, restore
+from gsim3d.train.run import run_folder
 
 WORLDS = ("elastic", "cloth", "rigid")
 SEED = SETS["validation"][0]
@@ -87,15 +87,12 @@ def reproduce(job: Job, command: str, say: Callable[[str], None] = print) -> tup
     """
     pyplot()
     out = output_path(job.out)
-    if out.exists() and not out.is_dir():
-        raise InputError(f"--out: {out} is not a folder")
     worlds = _worlds(job)
     models = _models(job, worlds)
     if job.train is None and job.preset is not None:
         raise InputError("--preset: is the base run of --train, which is not given")
     base = None if job.train is None else base_run(load_ablations()[0], job.preset, n_steps=job.train or None)
-    out.mkdir(parents=True, exist_ok=True)
-    with only_one_writer(out):
+    with run_folder(out):
         run = _Run(job, out, say)
         run.score(models)
         for world in worlds if base else ():

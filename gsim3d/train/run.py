@@ -1,7 +1,7 @@
 """Implementation of ``gsim3d train``: starts or resumes a training run of one or several processes."""
 
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 
 from gsim3d.cuda_graphs import is_out_of_memory
@@ -15,6 +15,23 @@ from gsim3d.train.log import Sample
 from gsim3d.train.loop import Trainer
 from gsim3d.train.processes import joined
 from gsim3d.train.samples import check_scenes
+
+
+@contextmanager
+def run_folder(out: Path) -> Iterator[None]:
+    """Makes and locks the folder ``out``; removes it if nothing was written into it. Raises InputError if it is a file,
+    or as :func:`only_one_writer`."""
+    new = not out.exists()
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise InputError(f"--out: {out} is not a folder") from None
+    try:
+        with only_one_writer(out):
+            yield
+    finally:
+        with suppress(OSError):  # not empty
+            new and out.rmdir()
 
 
 def train(
@@ -53,8 +70,7 @@ def train(
         Path(cache).mkdir(parents=True, exist_ok=True)  # raises early if not writable
     opened = {"fitting": config.data.fitting, "fps": config.data.subsample_fps or None}
     scenes = [Scene.open(folder, cache_dir=cache, **opened) for folder in folders]
-    Path(out).mkdir(parents=True, exist_ok=True)
-    with joined(device) as processes, only_one_writer(Path(out)) if processes.is_first else nullcontext():
+    with joined(device) as processes, run_folder(Path(out)) if processes.is_first else nullcontext():
         report = print if processes.is_first else lambda *_: None
         trainer = Trainer(config, scenes, out, device=device, processes=processes)
         if trainer.step:

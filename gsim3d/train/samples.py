@@ -80,7 +80,8 @@ def check_scenes(scenes: Sequence[Scene], data: DataConfig, phases: Sequence[Pha
         for phase in phases:
             n_steps = (phase.history or data.history) + phase.horizon
             if scene.n_steps < n_steps:
-                raise InputError(f"{scene.path}: {scene.n_steps} steps; windows of {n_steps} steps do not fit")
+                too_long = f"windows of {n_steps} steps do not fit: lower history or horizon"
+                raise InputError(f"{scene.path}: {scene.n_steps} steps; {too_long}")
             if not data.leave_one_out and scene.n_cams - data.targets_apart * data.context_views < phase.target_views:
                 raise InputError(f"{scene.path}: {scene.n_cams} cameras; {phase.target_views} target views do not fit")
         if len(context_cameras(scene, data)) < data.context_views:

@@ -201,6 +201,8 @@ BAD = {
     "missing image": (["simulate", "{run}", "{missing image}", "--out", "{new}"], "is missing"),
     "other image size": (["simulate", "{run}", "{large}", "--out", "{new}"], "images of 48x48 pixels"),
     "demo needs a folder": (["demo", "--out", "{config}"], "is not a folder"),
+    "train needs a folder": (["train", "{config}", "--data", "{data}", "--out", "{config}"], "--out: "),
+    "too few steps": (["train", "{long}", "--data", "{data}", "--out", "{new}"], "100 steps do not fit: lower"),
     "unknown world": (["generate", "lava", "--out", "{new}"], "lava"),
 }
 
@@ -212,8 +214,9 @@ def test_bad_input_gets_one_line_and_exit_code_2(capsys, work, tmp_path, name):
     empty.mkdir()
     places = {
         "data": work / "data", "config": work / "train.yaml", "run": work / "run", "scene": work / "data/ball/0000",
-        "empty": empty, "new": tmp_path / "new",
+        "empty": empty, "new": tmp_path / "new", "long": tmp_path / "long.yaml",
     }  # fmt: skip
+    places["long"].write_text(TRAINING.replace("history: 2", "history: 99"))
     words = set(re.findall(r"{([\w ]+)}", " ".join(arguments)))
     for broken in words & {"image", "missing image", "metadata"}:
         places[broken] = broken_scene(work, tmp_path, broken)
