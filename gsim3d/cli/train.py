@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     from gsim3d.synth.held_out import refuse_held_out
     from gsim3d.train.config import TrainConfig
 
-    config = from_dict(TrainConfig, read_yaml(args.config)) if args.config else TrainConfig()
+    config = from_dict(TrainConfig, read_yaml(args.config), f"{args.config}: ") if args.config else TrainConfig()
     if args.print_config:
         print(yaml.safe_dump(to_dict(config), sort_keys=False), end="")
         return 0

@@ -121,7 +121,7 @@ def base_run(
     if config is None and preset not in bases:
         hint = did_you_mean(preset, bases)
         raise InputError(f"--preset: must be one of {', '.join(bases)}; got {preset!r}{hint}")
-    base = bases[preset] if config is None else from_dict(TrainConfig, read_yaml(config))
+    base = bases[preset] if config is None else from_dict(TrainConfig, read_yaml(config), f"{config}: ")
     return base if n_steps is None else with_steps(base, n_steps)
 
 

@@ -36,8 +36,8 @@ def from_dict(cls: type[T], content: dict, where: str = "", base: T | None = Non
     Raises:
         InputError: an unknown key, a missing one or a value of another type; the message names the key.
     """
+    what = where.removesuffix(": ") or cls.__name__
     if not isinstance(content, dict):
-        what = where.removesuffix(": ") or cls.__name__
         raise InputError(f"{what}: must be a mapping of settings; got {shown(content)}")
     hints = typing.get_type_hints(cls)
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
@@ -48,8 +48,7 @@ def from_dict(cls: type[T], content: dict, where: str = "", base: T | None = Non
     values = {}
     for name, field in fields.items():
         if name in content:
-            before = getattr(base, name) if base is not None else None
-            values[name] = _convert(hints[name], content[name], _join(where, name), before)
+            values[name] = _convert(hints[name], content[name], _join(where, name), getattr(base, name, None))
         elif base is not None:
             values[name] = getattr(base, name)
         elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
@@ -59,7 +58,9 @@ def from_dict(cls: type[T], content: dict, where: str = "", base: T | None = Non
     except (InputError, ValueError) as error:
         if isinstance(error, InputError) and (not where or str(error).startswith(where.split(":")[0] + ":")):
             raise
-        raise InputError(f"{where.removesuffix(': ') or cls.__name__}: {error}") from None
+        last = what.rpartition(" ")[2]  # which the error may name itself
+        own = what.removesuffix(last) if str(error).startswith((f"{last}.", f"{last}: ")) else f"{what}: "
+        raise InputError(f"{own}{error}") from None
 
 
 def upgraded(cls: type, content: Any) -> Any:
@@ -141,8 +142,7 @@ def _convert(hint: Any, value: Any, where: str, base: Any) -> Any:
 
 def _variant(cls: type, value: Any, where: str) -> type:
     """``cls``, or of a class with variants the one whose ``type`` is given."""
-    variants = getattr(cls, "VARIANTS", None)
-    if variants is None or not isinstance(value, dict):
+    if (variants := getattr(cls, "VARIANTS", None)) is None or not isinstance(value, dict):
         return cls
     kind = value.get("type")
     if kind not in variants:

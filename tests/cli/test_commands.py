@@ -234,7 +234,7 @@ def test_bad_input_gets_one_line_and_exit_code_2(capsys, work, tmp_path, name):
 def test_a_wrong_setting_is_named(capsys, work, tmp_path):
     (tmp_path / "bad.yaml").write_text("optimizer: {learning_rte: 1}\n")
     code, _, err = call(capsys, "train", tmp_path / "bad.yaml", "--data", work / "data", "--out", tmp_path / "run")
-    assert code == 2 and err.startswith("gsim3d: error: optimizer.learning_rte: unknown setting")
+    assert code == 2 and err.startswith(f"gsim3d: error: {tmp_path / 'bad.yaml'}: optimizer.learning_rte: unknown")
     assert not (tmp_path / "run").exists()
 
 
