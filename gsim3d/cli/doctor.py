@@ -1,4 +1,4 @@
-"""``gsim3d doctor``: checks the installation and runs a self-test of every op.
+"""Checks the installation and runs a self-test of every op.
 
 Without options: lists installed packages and compiled modules, and compares every op with known answers.
 
@@ -19,38 +19,36 @@ Exit code 0: all required packages work and all checks hold. 1: a failure, known
 """
 
 import argparse
+from pathlib import Path
 
 from gsim3d.cli.arguments import whole
+from gsim3d.errors import InputError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("stability of a model or of scenes")
-    group.add_argument(
+    add = parser.add_argument_group("stability of a model or of scenes").add_argument
+    add(
         "--stability",
         nargs="*",
         metavar="PATH",
         help="test invariances and run stress tests of a checkpoint, or of a preset with random weights (default: "
         "tiny), on a scene or folder of scenes (default: random images)",
     )
-    group.add_argument(
-        "--out", metavar="DIR", default="runs/stability", help="folder of the report (default: %(default)s)"
-    )
-    group.add_argument("--steps", type=whole(1), default=100, help="steps of the long rollout (default: %(default)s)")
-    group.add_argument("--only", nargs="+", metavar="CHECK", default=(), help="checks to run (default: all)")
-    group.add_argument(
-        "--full", action="store_true", help="all particles, four views and the whole history (default: a sample)"
-    )
-    group.add_argument("--replay", metavar="FILE", help="rerun the check of FILE, a file in DIR/failures")
-    group.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where to compute (default: cpu)")
+    add("--out", metavar="DIR", default="runs/stability", help="folder of the report (default: %(default)s)")
+    add("--steps", type=whole(1), default=100, help="steps of the long rollout (default: %(default)s)")
+    add("--only", nargs="+", metavar="CHECK", default=(), help="checks to run (default: all)")
+    add("--full", action="store_true", help="all particles, four views and the whole history (default: a sample)")
+    add("--replay", metavar="FILE", help="rerun the check of FILE, a file in DIR/failures")
+    add("--device", choices=("cpu", "cuda"), default="cpu", help="where to compute (default: cpu)")
 
 
 def run(args: argparse.Namespace) -> int:
     if args.stability is None and not args.replay:
         from gsim3d.testing.doctor import check_installation
 
+        if args.only or args.full or args.device != "cpu":
+            raise InputError("--only, --full and --device need --stability (see gsim3d doctor --help)")
         return 0 if check_installation() else 1
-    from pathlib import Path
-
     from gsim3d.pretrained.loading import check_device
     from gsim3d.testing.stability import check_stability, describe, replay
 

@@ -1,4 +1,4 @@
-"""Write 3D Gaussians in a format that other tools open, or as a video.
+"""Writes 3D Gaussians in a format that other tools open, or as a video.
 
 FILE's suffix chooses the format (docs/reference/splat_formats.md has their bounds):
   .ply             3DGS layout, read by everything               .spz              Niantic, Babylon, Cesium

@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     help = "number of scenes, assigned to objects in turn"
     add("--trajectories", dest="n_trajectories", type=whole(1), metavar="N", help=help)
     add("--seed", type=whole(0), help="random seed (default 0)")
-    objects = "ball,blob,box,capsule,cone,cylinder,ellipsoid,spot,star,torus"
+    objects = "ball, blob, box, capsule, cone, cylinder, ellipsoid, spot, star, torus"
     add("--objects", type=_names, metavar="A,B", help=f"{objects} (default: those of the preset), or none")
     add(
         "--mesh",

@@ -1,4 +1,4 @@
-"""Look around in a prediction or a scene in a browser: orbit, play, pause, scrub, edit.
+"""Shows a prediction or a scene in a browser: orbit, play, pause, scrub, edit.
 
 Serves the viewer on this machine, prints its address and runs until Ctrl-C. It needs pip install 'gsim3d[viewer]'.
 

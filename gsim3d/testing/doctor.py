@@ -76,7 +76,7 @@ def _compiled() -> bool:
         return False
     cuda, has_gpu = ops.cuda_compiled(), torch.cuda.is_available()
     kernels = " and CUDA kernels" if cuda else ""
-    _row("ok", "gsim3d._ops", f"CPU kernels ({torch.get_num_threads()} threads){kernels}")
+    _row("ok", "gsim3d._ops", f"CPU kernels (threads: {torch.get_num_threads()}){kernels}")
     if has_gpu:
         _row("ok" if cuda else "-", "GPU", torch.cuda.get_device_name())
     if not cuda:

@@ -86,6 +86,8 @@ def test_full_check_sample_size(tmp_path):
         (["--stability", "smal"], "smal: no such file or folder; did you mean small?"),
         (["--stability", "--full"], "--full needs scenes"),
         (["--stability", "small", "--full"], "--full needs scenes"),
+        (["--device", "cuda"], "--only, --full and --device need --stability"),
+        (["--only", "gradients"], "--only, --full and --device need --stability"),
     ],
 )
 def test_full_check_refuses_missing_scenes(tmp_path, capsys, arguments, message):
