@@ -5,6 +5,7 @@ A layout is a module with NAME, FILE (the name of the description file), ``recog
 """
 
 import dataclasses
+from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
 
@@ -19,11 +20,15 @@ MAX_DEPTH = 3  # levels of subfolders that are searched
 
 def layout_of(folder: str | Path) -> ModuleType:
     """Returns the layout module of a scene folder. Raises InputError if no layout recognises it."""
-    found = _find(Path(folder))
-    if found is None:
-        lacks = f"scene folder: it has no {_files()} (see docs/reference/data.md)"
-        raise InputError(f"{folder} is not a {lacks if Path(folder).is_dir() else 'folder'}")
-    return found
+    if found := find_layout(Path(folder)):
+        return found
+    if not Path(folder).is_dir():
+        raise InputError(f"{folder} is not a folder")
+    with suppress(OSError):  # of folders that may not be read
+        below = sorted((*Path(folder).glob("*"), *Path(folder).glob("*/*")))
+        if inside := next(filter(find_layout, below), None):
+            raise InputError(f"{folder} is not a scene folder, but a folder of scenes: name one, such as {inside}")
+    raise InputError(f"{folder} is not a scene folder: it has no {_files()} (see docs/reference/data.md)")
 
 
 def read(folder: Path, problems: Problems) -> Recording:
@@ -48,7 +53,7 @@ def find_scenes(root: str | Path) -> list[Path]:
     for _ in range(MAX_DEPTH + 1):
         below = []
         for folder in folders:
-            if _find(folder):
+            if find_layout(folder):
                 found.append(folder)
             else:
                 below += [child for child in folder.iterdir() if child.is_dir() and not child.name.startswith(".")]
@@ -58,7 +63,8 @@ def find_scenes(root: str | Path) -> list[Path]:
     return sorted(found, key=lambda path: natural_order(path.relative_to(root).as_posix()))
 
 
-def _find(folder: Path) -> ModuleType | None:
+def find_layout(folder: Path) -> ModuleType | None:
+    """Returns the layout module that recognises ``folder``, or None."""
     return next((layout for layout in LAYOUTS if layout.recognises(folder)), None)
 
 

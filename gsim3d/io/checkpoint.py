@@ -268,7 +268,7 @@ def _load_single(path: Path) -> Checkpoint:
             metadata = file.metadata() or {}
         config, state = json.loads(metadata["gsim3d_config"]), json.loads(metadata["gsim3d_state"])
     except (safetensors.SafetensorError, KeyError, ValueError, RecursionError):
-        raise InputError(f"{path}: not a gsim3d checkpoint file (`gsim3d import` converts published weights)") from None
+        raise InputError(f"{path}: truncated, or not a gsim3d checkpoint file (see gsim3d import --help)") from None
     config, state = _known_format(config, path), _checked_state(state, path)
     return Checkpoint(model=_read_tensors(path), config=config, state=state, digest=sha256_of(path))
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import warnings
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,10 +40,7 @@ def open_target(
     path = Path(target)
     if path.is_file() and state_of(path):
         raise InputError(f"{path}: a state is drawn by its simulator: name it with --checkpoint")
-    is_scene = False
-    with suppress(InputError):
-        is_scene = path.is_dir() and not (path / GAUSSIANS).is_dir() and layouts.layout_of(path) is not None
-    if is_scene:
+    if path.is_dir() and not (path / GAUSSIANS).is_dir() and layouts.find_layout(path):
         if scene is not None or up is not None:
             raise InputError(f"{path} is a recorded scene; --scene and --up belong to files of Gaussians")
         recorded = Scene.open(path)

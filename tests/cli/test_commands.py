@@ -179,7 +179,7 @@ BAD = {
     "no scene": (["train", "{config}", "--data", "{empty}", "--out", "{new}"], "contains no scene"),
     "bad step": (["train", "{config}", "--data", "{data}", "--out", "{new}", "--until", "0"], "--until"),
     "bad export": (["train", "{config}", "--data", "{data}", "--out", "{new}", "--export", "a.pt"], "--export"),
-    "out is a file": (["train", "{config}", "--data", "{data}", "--out", "{config}"], "train.yaml"),
+    "out is a file": (["train", "{config}", "--data", "{data}", "--out", "{config}"], "is not a folder"),
     "no checkpoint": (["evaluate", "{empty}", "{data}"], "not a checkpoint"),
     "checkpoint is missing": (["evaluate", "{new}", "{data}"], "no such checkpoint"),
     "checkpoint is another file": (["evaluate", "{config}", "{data}"], "not a gsim3d checkpoint"),
@@ -189,6 +189,7 @@ BAD = {
     "no such view": (["evaluate", "{run}", "{data}", "--cameras", "9"], "camera 9 does not exist"),
     "no such input view": (["evaluate", "{run}", "{data}", "--context", "7"], "camera 7 does not exist"),
     "out exists": (["simulate", "{run}", "{scene}", "--out", "{empty}"], "exists already"),
+    "folder of scenes": (["simulate", "{run}", "{data}", "--out", "{new}"], "such as {data}/ball/0000"),
     "scene is missing": (["simulate", "{run}", "{new}/scene", "--out", "{new}"], "is not a folder"),
     "no such camera": (["simulate", "{run}", "{scene}", "--out", "{new}", "--cameras", "9"], "camera 9 does not exist"),
     "no such context camera": (["simulate", "{run}", "{scene}", "--out", "{new}", "--context", "-1"], "at least 0"),
@@ -201,7 +202,6 @@ BAD = {
     "missing image": (["simulate", "{run}", "{missing image}", "--out", "{new}"], "is missing"),
     "other image size": (["simulate", "{run}", "{large}", "--out", "{new}"], "images of 48x48 pixels"),
     "demo needs a folder": (["demo", "--out", "{config}"], "is not a folder"),
-    "train needs a folder": (["train", "{config}", "--data", "{data}", "--out", "{config}"], "--out: "),
     "too few steps": (["train", "{long}", "--data", "{data}", "--out", "{new}"], "100 steps do not fit: lower"),
     "unknown world": (["generate", "lava", "--out", "{new}"], "lava"),
 }
@@ -226,7 +226,7 @@ def test_bad_input_gets_one_line_and_exit_code_2(capsys, work, tmp_path, name):
     code, _, err = call(capsys, *(argument.format(**places) for argument in arguments))
     lines = [line for line in err.splitlines() if line.startswith("gsim3d: error: ")]
     assert code == 2, err
-    assert len(lines) == 1 and message in lines[0], err
+    assert len(lines) == 1 and message.format(**places) in lines[0], err
     assert "Traceback" not in err
     assert sorted(tmp_path.rglob("*")) == before
 

@@ -130,9 +130,11 @@ def test_other_files_are_refused(tmp_path):
         checkpoint.load(tmp_path / "missing")
     with pytest.raises(InputError, match="not a checkpoint"):
         checkpoint.load(tmp_path)
-    (tmp_path / "a.safetensors").write_bytes(b"something else")
-    with pytest.raises(InputError, match="not a gsim3d checkpoint file"):
-        checkpoint.load(tmp_path / "a.safetensors")
+    checkpoint.export(example(), tmp_path / "b.safetensors")
+    for content in (b"something else", (tmp_path / "b.safetensors").read_bytes()[:-1]):
+        (tmp_path / "a.safetensors").write_bytes(content)
+        with pytest.raises(InputError, match="truncated, or not a gsim3d checkpoint file"):
+            checkpoint.load(tmp_path / "a.safetensors")
     folder = checkpoint.save(tmp_path, example())
     (folder / "state.json").write_text("{")
     with pytest.raises(InputError, match="state.json"):
