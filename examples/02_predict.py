@@ -1,6 +1,6 @@
 """Predicts a scene with a shipped simulator; writes predicted images and 3D Gaussians.
 
-gsim3d generate elastic --preset diverse --objects ball --trajectories 1 --frames 12 --out runs/data
+gsim3d generate elastic --preset diverse --trajectories 7 --out runs/data
 python examples/02_predict.py runs/data/ball/0000 runs/example
 """
 

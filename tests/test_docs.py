@@ -122,6 +122,13 @@ def test_commands_parse(page):
         parser.parsed(words[1:])
 
 
+def test_data_sets_of_one_folder_are_the_same():
+    texts = [page.read_text() for page in (*TEXTS, *ROOT.glob("examples/*.py"))]
+    made = re.findall(r"^(gsim3d generate .*--out (\S+))", "\n".join(texts), re.MULTILINE)
+    commands = {folder: {command for command, named in made if named == folder} for _, folder in made}
+    assert len(commands) > 2 and not [several for several in commands.values() if len(several) > 1]
+
+
 def test_map_of_the_repository_is_complete():
     page = (DOCS / "contributing" / "architecture.md").read_text()
     named = set(re.findall(r"^ *(\S+?)/? {2,}\S", page.split("```text\n")[1].split("```")[0], re.MULTILINE))
