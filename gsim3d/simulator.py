@@ -33,7 +33,7 @@ from gsim3d.effects.edits import Edit, by_step, structure_of
 from gsim3d.effects.plan import Plan, by_plan, make_plan, unused_parameters
 from gsim3d.effects.selection import any_mask
 from gsim3d.effects.spec import EffectsSpec, OutputEffects, UnsupportedEffect
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, check_whole
 from gsim3d.math.spherical_harmonics import SH_0
 from gsim3d.nn.gaussian_head import GaussianHead, render
 from gsim3d.nn.multiview_encoder import Encoder, StaticShapes, pixel_rows
@@ -275,9 +275,10 @@ class Simulator(nn.Module):
             through all steps, also to displacements of actors.
 
         Raises:
-            InputError: an edit or actor is invalid (the message names its step and operation), or the number of
-                ``plans`` is not that of the scenes.
+            InputError: an edit or actor is invalid (the message names its step and operation), ``n_steps`` is no count,
+                or the number of ``plans`` is not that of the scenes.
         """
+        check_whole("rollout: n_steps", n_steps, 0)
         if plans is not None:
             if actors:
                 raise InputError("actors: scenes with plans of their own cannot have actors; give one plan")

@@ -10,6 +10,7 @@ from gsim3d import presets
 from gsim3d.cameras import Cameras, Frames
 from gsim3d.compat.released_model import ReleasedDynamicsConfig, ReleasedModelConfig, ReleasedSimulator, render_released
 from gsim3d.effects.spec import AppearanceEffects, DynamicsEffects, EffectsSpec, UnsupportedEffect
+from gsim3d.errors import InputError
 from gsim3d.nn.gaussian_head import RendererConfig, render
 from gsim3d.presets import ModelConfig
 from gsim3d.priors import GravityConfig, InertiaConfig, ProximityConfig, ShapeMatchingConfig, VelocityFromImagesConfig
@@ -152,6 +153,15 @@ def test_memory_of_broken_rows_is_not_used(name, activity):
     for seen in ("means", "opacities", "dynamic_latents", "irradiance_gain"):
         assert getattr(step, seen).isfinite().all(), seen
     assert simulator.render(step, target_cameras(frames, 1), torch.ones(3)).color.isfinite().all()
+
+
+@pytest.mark.parametrize("n_steps", [-1, 1.5, "2"])
+def test_rollout_refuses_what_is_no_number_of_steps(n_steps):
+    simulator = make_simulator()
+    state = simulator.encode(make_frames())
+    with pytest.raises(InputError, match="rollout: n_steps must be a whole number of at least 0; got"):
+        simulator.rollout(state, n_steps)
+    assert simulator.rollout(state, 0) == []
 
 
 def test_rollout_is_repeated_steps():

@@ -303,9 +303,7 @@ def load_edits(path: str | Path, encode: Callable[[Path], Particles]) -> list[Ed
     Raises:
         InputError: an entry is invalid; the message names file, step and operation.
     """
-    path = Path(path)
-    values = enumerate(read_yaml(path, list))
-    return [_edit(value, f"{path}: edit {i}", path.parent, encode) for i, value in values]
+    return [_edit(one, f"{path}: edit {i}", Path(path).parent, encode) for i, one in enumerate(read_yaml(path, list))]
 
 
 def _edit(values: Any, where: str, folder: Path, encode: Callable[[Path], Particles]) -> Edit:
