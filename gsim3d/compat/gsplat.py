@@ -16,7 +16,7 @@ from gsim3d.cameras import Cameras
 from gsim3d.errors import InputError, check_one_of
 from gsim3d.ops._arguments import check_floating, check_numbers, check_real, check_tensors, check_whole, constant
 from gsim3d.ops.projection import Projection, project_gaussians, sh_to_color
-from gsim3d.ops.raster import LARGEST, Rendering
+from gsim3d.ops.raster import LARGEST, Rendering, check_last_rows
 from gsim3d.ops.raster_projected import rasterize_projected
 
 OP = "rasterization"
@@ -219,6 +219,7 @@ def _check(camera_model: str, means, viewmats, Ks, opacities, optional: dict[str
     check_numbers(OP, largest_of=LARGEST, means=means, **given)
     check_numbers(OP, negative=False, scales=given.get("scales"))
     check_numbers(OP, largest_of=1.0, negative=False, opacities=opacities)
+    check_last_rows(OP, viewmats, Ks)
 
 
 def _lens(lens: str, radial: Tensor | None, tangential: Tensor | None, n_images: int) -> tuple[str, Tensor | None]:

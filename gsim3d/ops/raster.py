@@ -13,7 +13,7 @@ from gsim3d.cameras import Cameras
 from gsim3d.errors import GradientError, check_one_of
 from gsim3d.numerics.policy import OnInvalid, check_on_invalid
 from gsim3d.numerics.report import Finding, Reading, StabilityReport
-from gsim3d.ops._arguments import check_floating, check_real, check_tensors, check_whole, within_memory
+from gsim3d.ops._arguments import check_floating, check_numbers, check_real, check_tensors, check_whole, within_memory
 from gsim3d.ops._register import call, expanded, fakes, one_by_one, register_autocast, register_gradients
 
 OP = "rasterize_gaussians"
@@ -130,7 +130,7 @@ def rasterize_gaussians(
     rows = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
     if not compiling:
         optional = {"sh": sh, "colors": colors, "features": features, "background": background, "cu_rows": cu_rows}
-        _check_arguments(rows, optional | {"active": active}, cameras, near_plane)
+        _check(rows, optional | {"active": active}, cameras, near_plane)
     name, color = _check_choices(sh, colors, cutoff, jacobian, on_invalid)
     n, n_images = means.shape[0], cameras.viewmats.shape[0]
     real = torch.float64 if means.dtype == torch.float64 else torch.float32
@@ -210,9 +210,7 @@ def _counted(counts: Tensor, names: list[str]) -> Reading:
     return Reading([Finding(what, OP, name, "clamped", n) for name, n in found if n], {})
 
 
-def _check_arguments(
-    rows: dict[str, Tensor], optional: dict[str, Tensor | None], cameras: Cameras, near_plane: float
-) -> None:
+def _check(rows: dict[str, Tensor], optional: dict[str, Tensor | None], cameras: Cameras, near_plane: float) -> None:
     """Types, and the shapes that are read before the kernel checks them."""
     optional = {name: value for name, value in optional.items() if value is not None}
     check_real(OP, near_plane=near_plane)
@@ -226,16 +224,21 @@ def check_scene(op: str, tensors: dict[str, Tensor], cameras: Cameras, **sizes: 
     """Types of all arguments, and numbers of dimensions that are read before a kernel checks them."""
     if not isinstance(cameras, Cameras):
         raise TypeError(f"{op}: cameras must be gsim3d.Cameras; got {type(cameras).__name__}")
-    of_cameras = {"cameras.viewmats": cameras.viewmats, "cameras.Ks": cameras.Ks}
-    tensors = tensors | of_cameras | {"cameras.image_cloud": cameras.image_cloud}
+    tensors = tensors | {f"cameras.{name}": getattr(cameras, name) for name in ("viewmats", "Ks", "image_cloud")}
     check_tensors(op, **tensors)
     check_floating(op, means=tensors["means"])
     check_whole(op, **sizes, **{"cameras.width": cameras.width, "cameras.height": cameras.height})
     shapes = {"means": "[N, 3]", "cameras.viewmats": "[I, 4, 4]", "cameras.Ks": "[I, 3, 3]", "cu_rows": "[Q + 1]"}
     for name, shape in shapes.items():
-        value = tensors.get(name)
-        if value is not None and value.dim() != shape.count(",") + 1:
+        if (value := tensors.get(name)) is not None and value.dim() != shape.count(",") + 1:
             raise ValueError(f"{op}: {name} must be {shape}; got {list(value.shape)}")
+    check_last_rows(op, cameras.viewmats, cameras.Ks)
+
+
+def check_last_rows(op: str, viewmats: Tensor, Ks: Tensor) -> None:
+    """Raises NumericalError where matrices on the CPU have another last row than 0, 0, (0,) 1."""
+    rows = {"viewmats[..., 3, :3]": viewmats[..., 3:4, :3], "Ks[..., 2, :2]": Ks[..., 2:3, :2]}
+    check_numbers(op, largest_of=1e-3, **{f"{name} (0 unless transposed)": row for name, row in rows.items()})
 
 
 def _check_choices(
@@ -274,8 +277,7 @@ def sizes_of_state(means: Tensor, n_images: int, n_clouds: int, width: int, heig
     if means.device.type != "cuda":
         return 0, 0, 0
     n, tiles = means.shape[0], _tiles(n_images, width, height)
-    views = (n_images + n_clouds - 1) // max(1, n_clouds)
-    pairs = max(n, min(n * views, 2**25))
+    pairs = max(n, min(n * -(-n_images // max(1, n_clouds)), 2**25))
     entries = min(pairs + pairs // 4 + 1024 * tiles, 2**30)
     slots = min(pairs + pairs // 2 + 2048 * tiles, 2**30)
     return pairs, max(n, entries), max(4 * n, slots)
@@ -287,9 +289,8 @@ def state_bytes(
     """raster_state_bytes of csrc/gsim3d/raster/raster.h."""
     if means.device.type != "cuda":
         return 0
-    real = means.element_size()
+    real, tiles = means.element_size(), _tiles(n_images, width, height)
     view = 112 if real == 4 else 200
-    tiles = _tiles(n_images, width, height)
     lists = (8 * max_pairs, 12 * real * max_pairs, 4 * max_pairs, 4 * tiles, 32 * tiles, 4 * max_slots)
     return sum((n + 63) // 64 * 64 for n in (64, view * n_images, 16 * n_clouds, 4 * n_images, *lists))
 

@@ -339,6 +339,9 @@ def test_bad_numbers_are_named_on_a_cpu(batch):
         wrong.view(-1)[7] = value
         with pytest.raises(NumericalError, match=f"rasterization: {name} must be finite"):
             rasterization(**arguments | {name: wrong}, **SIZE)
+    for name in ("viewmats", "Ks"):
+        with pytest.raises(NumericalError, match=rf"rasterization: {name}\[.*\] \(0 unless transposed\) must be"):
+            rasterization(**arguments | {name: arguments[name].mT.contiguous()}, **SIZE)
     backgrounds = torch.full((*batch, 2, 3), math.inf).double()
     with pytest.raises(NumericalError, match="rasterization: backgrounds must be finite"):
         rasterization(**arguments, **SIZE, backgrounds=backgrounds)

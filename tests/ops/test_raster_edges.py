@@ -365,6 +365,12 @@ def test_bad_rows_are_named(name, value, message):
     assert (caught.value.tensor, caught.value.row, caught.value.camera) == (message.split(":")[0], 2, 0)
 
 
+@pytest.mark.parametrize("name, place", [("viewmats", (0, 3, 0)), ("Ks", (0, 2, 1))])
+def test_transposed_matrices_are_named_on_a_cpu(name, place):
+    with pytest.raises(NumericalError, match=rf"rasterize_gaussians: {name}\[.*\] \(0 unless transposed\) .* got 3"):
+        change(four_rows(), name, place, 3.0).render()
+
+
 @pytest.mark.parametrize("broken, message", BAD_DATA)
 def test_bad_data_is_named(broken, message):
     with pytest.raises(ValueError, match="rasterize_gaussians: " + message):
