@@ -19,8 +19,7 @@ from gsim3d.errors import InputError, naming
 
 NAME = "genesis"
 FILE = "metadata.json"
-DEFAULT_FPS = 42.0  # of the published data sets, whose metadata has no fps
-DEFAULT_NEAR, DEFAULT_FAR = 1.0, 8.0  # metres, of the published data sets
+DEFAULTS = {"fps": 42.0, "near": 1.0, "far": 8.0}  # of the published data sets, whose metadata has none of them
 TEMPLATE_FIELDS = {"cam_ix", "n_step", "img_type"}
 
 
@@ -50,16 +49,17 @@ def read(folder: Path, problems: Problems) -> Recording:
         return read_images
 
     has_labels = any(file_of(cam, 0, "seg").is_file() for cam in range(n_cams))
-    given = metadata.workspace(DEFAULT_NEAR, DEFAULT_FAR)
+    noted = "fps" not in metadata.values and metadata.values.keys() & {"near", "far"}
     return Recording.of_cameras(
         cameras,
         n_steps,
         layout=NAME,
         source=source,
-        fps=metadata.positive("fps") or DEFAULT_FPS,
+        fps=metadata.positive("fps") or DEFAULTS["fps"],
         read_images=reader("rgb", as_color),
         read_labels=reader("seg", as_labels) if has_labels else None,
-        **given,
+        notes=(f"{FILE} has no fps; {DEFAULTS['fps']:g} is used, as for the published sets",) if noted else (),
+        **metadata.workspace(DEFAULTS["near"], DEFAULTS["far"]),
     )
 
 

@@ -34,6 +34,15 @@ def test_genesis_scene_attributes(tmp_path):
     assert scene.origin.dtype == np.float64 and scene.origin.tolist() == [-2.0, -2.0, -0.5]
 
 
+def test_genesis_default_frame_rate_of_an_own_file_is_noted(tmp_path):
+    notes = {"fps": ("metadata.json has no fps; 42 is used, as for the published sets",), "origin": ()}
+    for key, expected in notes.items():
+        write_scene(tmp_path / key, edits={key: None})
+        assert Scene.open(tmp_path / key).recording.notes == expected
+    write_scene(tmp_path / "published", edits=dict.fromkeys(("fps", "near", "far")))
+    assert Scene.open(tmp_path / "published").recording.notes == ()
+
+
 def test_genesis_cameras_equal_the_metadata(tmp_path):
     """Extrinsics are world-to-camera, intrinsics stay in pixels with the full principal point."""
     write_scene(tmp_path)
