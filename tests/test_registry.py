@@ -24,7 +24,7 @@ def needs_autograd(op: str) -> bool:
 
 
 def is_gradient(op: str) -> bool:
-    return "_backward" in op or "_grad_" in op
+    return "_backward" in op or "_grad_" in op or "_tangent" in op
 
 
 def test_ops_are_found():

@@ -89,6 +89,10 @@ TOLERANCES = {
         1e-4, 8.2e-6, EPYC, "float32 on both sides, advised by the notes of the tensors"
     ),
     "raster_grad_float64": Tolerance(2e-13, 1.1e-14, EPYC, "as raster_grad_float32, in float64"),
+    "raster_tangent_float32": Tolerance(1e-4, 1.1e-5, EPYC, "forward mode, float32 against float64"),
+    "raster_tangent_float64": Tolerance(5e-13, 1.4e-14, EPYC, "as raster_tangent_float32, in float64"),
+    "raster_many_tangent_float32": Tolerance(5e-5, 4.7e-6, EPYC, "as raster_tangent_float32, thousands of layers"),
+    "raster_many_tangent_float64": Tolerance(5e-13, 1.1e-14, EPYC, "as raster_many_tangent_float32, in float64"),
     "sparse_conv_float32": Tolerance(
         5e-6, 1.6e-6, EPYC, "float32 chains of up to 125 taps x 17 channels against float64"
     ),

@@ -137,9 +137,9 @@ def _function_of(op: str, backward: Callable, setup: Callable, jvp: Callable | N
 
 
 def expanded(size: int, inputs: Sequence[Any], is_batched: Sequence[bool]) -> list[Any]:
-    """Tensors or None, each tensor with the batch in front."""
+    """``inputs``, each tensor with the batch in front."""
     pairs = zip(inputs, is_batched, strict=True)
-    return [x if has or x is None else x.expand(size, *x.shape) for x, has in pairs]
+    return [x if has or not isinstance(x, Tensor) else x.expand(size, *x.shape) for x, has in pairs]
 
 
 def one_by_one(op: str) -> Callable:

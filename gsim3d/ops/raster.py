@@ -100,9 +100,8 @@ def rasterize_gaussians(
         Rendering, dtype of ``means``.
     Gradients:
         means, quats, scales, opacities, sh or colors, features, background, ``cameras.viewmats`` (its 12 upper
-        entries taken as free numbers): once, also under ``torch.func`` (grad, vjp, vmap); on the CPU twice, and in
-        forward mode. A Gaussian gets none from a pixel where its alpha is cut to 0.99, and its colour none where it
-        was clamped at 0.
+        entries taken as free numbers): once, also in forward mode and under ``torch.func``; on the CPU twice. A
+        Gaussian gets none from a pixel where its alpha is cut to 0.99, and its colour none where it was clamped at 0.
     Determinism:
         equal bits for any number of threads, forward and backward; on a GPU from run to run.
     GPU: nothing waits for the device. Its memory is made for Gaussians of a few pixels and clouds shown by equally many
@@ -321,9 +320,10 @@ def _gradients(grad_color, grad_alpha, grad_depth, grad_features, transmittance,
     return tuple(inputs[0].new_empty(shape) for shape in shapes)
 
 
-TANGENT = "rasterize_gaussians_backward_tangent"  # of images and of gradients, along a direction
+TANGENT, SECOND = f"{OP}_tangent", f"{OP}_backward_tangent"  # of images; of images and gradients, along a direction
 fakes(**{OP: _images, f"{OP}_backward": _gradients})
-fakes(**{TANGENT: lambda *inputs: tuple(x.new_empty(x.shape) for x in (*inputs[19:23], *inputs[:8]))})
+fakes(**{TANGENT: lambda *x: tuple(empty_images(x[9], x[16].shape[0], x[20], x[21], x[14].shape[1], 0)[:4])})
+fakes(**{SECOND: lambda *inputs: tuple(x.new_empty(x.shape) for x in (*inputs[19:23], *inputs[:8]))})
 
 
 def _setup(ctx, inputs, output):
@@ -341,48 +341,45 @@ def _backward(ctx, *grads):
     return (*grads, viewmats if viewmats_grad else None, *[None] * 13)
 
 
-def _folded(size: int, scene: Sequence[Tensor], is_batched: Sequence[bool], options: Sequence) -> tuple[list, list]:
-    """Scenes of a batch one after the other in a single call: its 11 tensors, and options with its sizes."""
-    rows = expanded(size, scene, is_batched)
-    means, viewmats, (image_cloud, cu_rows) = rows[0], rows[7], rows[9:]
+def _folded(k: int, size: int, inputs: Sequence, is_batched: Sequence[bool]) -> list:
+    """Inputs of a batch as those of a single call, scenes one after the other; input ``k`` is the first of a scene."""
+    rows = expanded(size, inputs, is_batched)
+    means, (image_cloud, cu_rows, *image) = rows[k], rows[k + 9 : k + 13]
     n_clouds, entry = cu_rows.shape[1] - 1, torch.arange(size, device=means.device)[:, None]
     ends = (cu_rows[:, 1:] + means.shape[1] * entry).flatten()
-    lists = [(image_cloud + n_clouds * entry).flatten(), torch.cat([cu_rows[0, :1], ends])]
-    rows = [x.flatten(0, 1) for x in rows[:9]] + lists
-    width, height = options[:2]
-    return rows, [*options[:5], *sizes_of_state(rows[0], size * viewmats.shape[1], size * n_clouds, width, height)]
+    rows = [x.flatten(0, 1) if isinstance(x, Tensor) else x for x in rows]
+    rows[k + 9 : k + 11] = (image_cloud + n_clouds * entry).flatten(), torch.cat([cu_rows[0, :1], ends])
+    rows[k + 16 : k + 19] = sizes_of_state(rows[k], len(rows[k + 7]), size * n_clouds, *image)
+    return rows
 
 
 def _batched(size, inputs, is_batched):
-    rows, options = _folded(size, inputs[:11], is_batched[:11], inputs[11:])
-    active = [x if x is None else x.flatten(0, 1) for x in expanded(size, inputs[20:], is_batched[20:])]
-    *images, state, unusable = call(OP, *rows, *options, inputs[19], *active)
+    *images, state, unusable = call(OP, *_folded(0, size, inputs, is_batched))
     images = [x.unflatten(0, (size, -1)) for x in images]
     return (*images, state.expand(size, -1), unusable.reshape(size, -1, 2))  # the state is of all of them
 
 
-def _backward_batched(size, inputs, is_batched):
-    if not is_batched[6]:  # the state is of one scene, which all entries share: only gradients of its images differ
-        return one_by_one(f"{OP}_backward")(size, inputs, is_batched)
-    of_images = [x.flatten(0, 1) for x in expanded(size, inputs[:6], is_batched[:6])]
-    rows, options = _folded(size, inputs[7:18], is_batched[7:18], inputs[18:])
-    active = [x if x is None else x.flatten(0, 1) for x in expanded(size, inputs[27:], is_batched[27:])]
-    grads = call(f"{OP}_backward", *of_images, inputs[6][0], *rows, *options, inputs[26], *active)
-    return tuple(x.reshape(size, x.shape[0] // size, *x.shape[1:]) for x in grads)
+def _kept_batched(op, k, size, inputs, is_batched):
+    """Of an op whose input ``k`` is the state, with the scene behind it."""
+    if not is_batched[k]:  # the state is of one scene, which all entries share: only what is in front of it differs
+        return one_by_one(op)(size, inputs, is_batched)
+    rows = _folded(k + 1, size, [*inputs[:k], None, *inputs[k + 1 :]], is_batched)
+    found = call(op, *rows[:k], inputs[k][0], *rows[k + 1 :])
+    return tuple(x.reshape(size, x.shape[0] // size, *x.shape[1:]) for x in found)
 
 
-def _tangent(scene, tangents, images, options, active):
-    """What TANGENT says of the 11 tensors of a scene; None: 0."""
-    if scene[0].device.type != "cpu":
-        said = "is once differentiable on a GPU, in reverse mode; use tensors on the CPU"
-        raise GradientError(f"{OP} (order 2): the rasterizer {said}", op=OP, argument=None, order=2)
-    along = [torch.zeros_like(x) if t is None or t.shape != x.shape else t for t, x in zip(tangents, scene)]
-    return call(TANGENT, *scene, *along, *images, *options, *active)
+def _along(tangents, scene):
+    return [torch.zeros_like(x) if t is None or t.shape != x.shape else t for t, x in zip(tangents, scene)]
 
 
 def _jvp(inputs, tangents, outputs):
-    zeros = [torch.zeros_like(x) for x in outputs[:4]]
-    return (*_tangent(inputs[:11], tangents[:8], zeros, inputs[11:16], inputs[20:])[:4], *[None] * 4)
+    return (*call(TANGENT, *_along(tangents[:8], inputs), outputs[6], *inputs[:19], *inputs[20:]), *[None] * 4)
+
+
+def _second(scene, tangents, images, options, active):
+    if scene[0].device.type != "cpu":
+        _refuse(2, "second derivative on a GPU; use tensors on the CPU")
+    return call(SECOND, *scene, *_along(tangents, scene), *images, *options, *active)
 
 
 def _second_setup(ctx, inputs, output):
@@ -393,23 +390,25 @@ def _second_setup(ctx, inputs, output):
 
 def _second_backward(ctx, *grads):
     saved = ctx.saved_tensors
-    tangents = _tangent(saved[4:15], grads, saved[:4], ctx.options, saved[15:])
+    tangents = _second(saved[4:15], grads, saved[:4], ctx.options, saved[15:])
     return (*tangents[:4], None, None, None, *tangents[4:], *[None] * 13)
 
 
 def _second_jvp(inputs, tangents, outputs):
-    images = [torch.zeros_like(x) if t is None else t for t, x in zip(tangents[:4], inputs[:4])]
-    linear = call(f"{OP}_backward", *images, *inputs[4:])
-    others = _tangent(inputs[7:18], tangents[7:15], inputs[:4], inputs[18:23], inputs[27:])[4:]
+    linear = call(f"{OP}_backward", *_along(tangents[:4], inputs), *inputs[4:])
+    others = _second(inputs[7:18], tangents[7:15], inputs[:4], inputs[18:23], inputs[27:])[4:]
     return tuple(a + b if a.shape == b.shape else a for a, b in zip(linear, others, strict=True))
 
 
-def _third(ctx, *_):
-    said = "has no third derivative (order 3) and none of forward mode; detach the second, or use torch.func.hessian"
-    raise GradientError(f"{OP}: the rasterizer {said}", op=OP, argument=None, order=3)
+def _refuse(order, said, *_):
+    raise GradientError(f"{OP} (order {order}): the rasterizer has no {said}", op=OP, argument=None, order=order)
 
 
 register_gradients(OP, _backward, _setup, without=["Ks"], jvp=_jvp, batched=_batched)
-register_gradients(f"{OP}_backward", _second_backward, _second_setup, jvp=_second_jvp, batched=_backward_batched)
-register_gradients(TANGENT, _third, lambda ctx, inputs, output: None, jvp=_third, batched=one_by_one(TANGENT))
+rule = partial(_kept_batched, f"{OP}_backward", 6)
+register_gradients(f"{OP}_backward", _second_backward, _second_setup, jvp=_second_jvp, batched=rule)
+rule, none = partial(_refuse, 2, "derivative of forward mode; use torch.func.hessian, on the CPU"), lambda *_: None
+register_gradients(TANGENT, rule, none, jvp=rule, batched=partial(_kept_batched, TANGENT, 8))
+rule = partial(_refuse, 3, "third derivative, and none of forward mode; detach the second, or use torch.func.hessian")
+register_gradients(SECOND, rule, none, jvp=rule, batched=one_by_one(SECOND))
 register_autocast(OP, "float32")

@@ -11,8 +11,9 @@ from gsim3d import ops
 from gsim3d.testing import selftest
 from tests.testing import plain_torch
 
-# What a fused network calls itself (tests/nn/test_fused_block.py), a GPU alone needs, and a CPU alone has.
-NOT_ALONE = {"patch_attention_backward_packed", "sparse_conv_plan", "rasterize_gaussians_backward_tangent"}
+# What a fused network calls itself (tests/nn/test_fused_block.py), a GPU alone needs, and derivatives along tangents.
+TANGENTS = {"rasterize_gaussians_tangent", "rasterize_gaussians_backward_tangent"}
+NOT_ALONE = {"patch_attention_backward_packed", "sparse_conv_plan"} | TANGENTS
 CORE = Path(__file__).parents[2] / "csrc" / "gsim3d"
 
 

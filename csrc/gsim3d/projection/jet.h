@@ -14,7 +14,7 @@ struct Jet {
   V along[kN];
 
   Jet() = default;
-  GSIM3D_HD Jet(const V& constant) : value(constant) {
+  GSIM3D_HD Jet(V constant) : value(constant) {
     for (int i = 0; i < kN; ++i) along[i] = V(0);
   }
   template <typename Number>

@@ -154,12 +154,12 @@ template <typename T>
 void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& image_grads,
                      const RasterSceneGrads<T>& grads, const Workspace& workspace, const Parallel& parallel);
 
-// Derivatives along `tangents`: of the images (color, alpha, depth and features are written) and of every gradient that
-// raster_backward gives for `image_grads` (of which transmittance and last are not read).
+// Derivatives along `tangents`: of the images (color, alpha, depth and features are written) and, unless `grads` is
+// null, of every gradient that raster_backward gives for `image_grads` (of which transmittance and last are not read).
 template <typename T>
 void raster_tangent(const RasterScene<T>& scene, const RasterTangents<T>& tangents,
                     const RasterImageGrads<T>& image_grads, const RasterImages<T>& images,
-                    const RasterSceneGrads<T>& grads, const Workspace& workspace, const Parallel& parallel);
+                    const RasterSceneGrads<T>* grads, const Workspace& workspace, const Parallel& parallel);
 
 }  // namespace cpu
 
@@ -192,6 +192,11 @@ template <typename T>
 void raster_backward(const RasterScene<T>& scene, const RasterImageGrads<T>& image_grads,
                      const RasterSceneGrads<T>& grads, const RasterLimits& limits, void* state,
                      const Workspace& workspace, Stream stream);
+
+// Derivatives along `tangents` of color, alpha, depth and features, whose arrays in `images` are written.
+template <typename T>
+void raster_tangent(const RasterScene<T>& scene, const RasterTangents<T>& tangents, const RasterImages<T>& images,
+                    const RasterLimits& limits, void* state, const Workspace& workspace, Stream stream);
 
 }  // namespace cuda
 }  // namespace gsim3d

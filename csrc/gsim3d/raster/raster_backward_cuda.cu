@@ -28,21 +28,13 @@ __global__ void __launch_bounds__(kOneBlock) gather_images_kernel(Job<T> job, Sl
 
 template <typename T>
 __device__ void gather_any(const Job<T>& job, const Slots<T>& slots, const RasterSceneGrads<T>& grads) {
-  const auto gather = [&](auto terms) {
+  dispatch_terms(job.scene.sh_terms, [&](auto terms) {
     constexpr int kTerms = decltype(terms)::value;
     if constexpr (kTerms != kProjected)
       if (slots.viewmats) gather_viewmats<T, kTerms>(job, slots);
     cooperative_groups::this_grid().sync();
     gather_rows<T, kTerms>(job, slots, grads, dynamic_memory);
-  };
-  switch (job.scene.sh_terms) {
-    case kProjected: return gather(std::integral_constant<int, kProjected>{});
-    case 0: return gather(std::integral_constant<int, 0>{});
-    case 1: return gather(std::integral_constant<int, 1>{});
-    case 4: return gather(std::integral_constant<int, 4>{});
-    case 9: return gather(std::integral_constant<int, 9>{});
-    default: return gather(std::integral_constant<int, 16>{});
-  }
+  });
 }
 
 template <typename T, bool kFade>

@@ -6,6 +6,9 @@
 // ever added up across lanes.
 #pragma once
 
+#include <algorithm>
+#include <type_traits>
+
 #include "gsim3d/raster/raster_project.cuh"
 
 namespace gsim3d::raster {
@@ -74,23 +77,25 @@ __device__ int64_t pixel_of(const RasterScene<T>& s, const Quarter& quarter, int
 
 // Values of the batch, by entry, four of them in one load. With x, y counted from the first pixel's centre,
 // alpha = 2^(strength - u^2 - v^2), u = ux x + uy y + u0, v = vy y + v0.
-template <typename T>
+template <typename V>
 struct Batch {
-  struct alignas(4 * sizeof(T)) Shape {
-    T ux, uy, u0, vy;
+  static constexpr size_t kAligned = std::min(4 * sizeof(V), size_t{32});  // as far as dynamic_memory is
+  struct alignas(kAligned) Shape {
+    V ux, uy, u0, vy;
   } shapes[kWarp];
-  struct alignas(4 * sizeof(T)) Value {
-    T red, green, blue, depth;
+  struct alignas(kAligned) Value {
+    V red, green, blue, depth;
   } values[kWarp];
-  struct alignas(2 * sizeof(T)) Rest {
-    T v0, strength;
+  struct alignas(2 * sizeof(V)) Rest {
+    V v0, strength;
   } rests[kWarp];
 };
 
-template <typename T>
-__device__ void put(const Record<T>& r, const Quarter& quarter, int lane, Batch<T>& batch) {
-  const T x = r.x - (T(quarter.x0) + T(0.5)), y = r.y - (T(quarter.y0) + T(0.5));
-  const T uy = -r.tight * r.slope;
+template <typename V>
+__device__ void put(const Record<V>& r, const Quarter& quarter, int lane, Batch<V>& batch) {
+  using T = PlainOf<V>;
+  const V x = r.x - (T(quarter.x0) + T(0.5)), y = r.y - (T(quarter.y0) + T(0.5));
+  const V uy = -r.tight * r.slope;
   batch.shapes[lane] = {r.tight, uy, -(r.tight * x + uy * y), r.loose};
   batch.values[lane] = {r.red, r.green, r.blue, r.z};
   batch.rests[lane] = {-r.loose * y, r.strength};
@@ -103,25 +108,27 @@ __device__ __forceinline__ T in_register(T value) {
 }
 
 // alpha of entry j at (x, y) before it is cut.
-template <typename T>
-__device__ __forceinline__ T alpha_at(const Batch<T>& batch, int j, T x, T y) {
+template <typename V, typename T>
+__device__ __forceinline__ V alpha_at(const Batch<V>& batch, int j, T x, T y) {
   const auto shape = batch.shapes[j];
   const auto rest = batch.rests[j];
-  const T u = shape.ux * x + (shape.uy * y + shape.u0), v = shape.vy * y + rest.v0;
+  const V u = shape.ux * x + (shape.uy * y + shape.u0), v = shape.vy * y + rest.v0;
   return fast_exp2(rest.strength - u * u - v * v);
 }
 
 // Pixels of the quarter that the record may reach, for each row the bits of its columns. May err outwards only. The
 // record's bounds say no more: within a quarter, what they leave out is out of reach.
-template <typename T>
-__device__ void cover(const Record<T>& r, const Quarter& quarter, uint32_t (&spans)[kQuarter]) {
+template <typename V>
+__device__ void cover(const Record<V>& r, const Quarter& quarter, uint32_t (&spans)[kQuarter]) {
+  using T = PlainOf<V>;
   constexpr double kLog2MaxRatio = 7.994353436858858;  // log2(255)
-  const T x = r.x - (T(quarter.x0) + T(0.5)), y = r.y - (T(quarter.y0) + T(0.5));
-  const T width = fast_reciprocal(r.tight), most = (r.strength + T(kLog2MaxRatio + kLevelSlack)) * width * width;
-  const T decay = r.loose * width, first_decay = -decay * y, first_centre = x - r.slope * y;
+  const T x = plain(r.x) - (T(quarter.x0) + T(0.5)), y = plain(r.y) - (T(quarter.y0) + T(0.5));
+  const T slope = plain(r.slope), width = fast_reciprocal(plain(r.tight));
+  const T most = (plain(r.strength) + T(kLog2MaxRatio + kLevelSlack)) * width * width;
+  const T decay = plain(r.loose) * width, first_decay = -decay * y, first_centre = x - slope * y;
 #pragma unroll
   for (int row = 0; row < kQuarter; ++row) {
-    const T centre = first_centre + r.slope * T(row), lost = first_decay + decay * T(row);
+    const T centre = first_centre + slope * T(row), lost = first_decay + decay * T(row);
     const T reach = fast_sqrt(max_of(most - lost * lost, T(0)));
     const uint32_t from = min(ceil_to_whole(centre - T(kPixelSlack) - reach), uint32_t{kQuarter});
     const uint32_t to = min(floor_to_whole(centre + T(1 + kPixelSlack) + reach), uint32_t{kQuarter});
@@ -129,53 +136,60 @@ __device__ void cover(const Record<T>& r, const Quarter& quarter, uint32_t (&spa
   }
 }
 
-template <typename T>
-__device__ inline T background_of(const RasterScene<T>& s, int64_t image, int channel) {
-  const T value = s.background[3 * image + channel];
-  return usable(value) ? value : T(0);
+template <typename V, typename T>
+__device__ inline V background_of(const RasterScene<T>& s, int64_t image, int channel, const T* tangents = nullptr) {
+  const V value = argument<V>(s.background, tangents, 3 * image + channel);
+  return usable(plain(value)) ? value : V(0);
 }
 
-// Row of the features of a pair.
+// Place of the features of a pair.
 template <typename T>
-__device__ inline const T* features_of(const Job<T>& job, int64_t image, uint32_t pair) {
+__device__ inline int64_t features_of(const Job<T>& job, int64_t image, uint32_t pair) {
   const int64_t row = job.views[image].row_begin + pair - job.pair_begin[image];
-  return job.scene.features + row * job.scene.n_features;
+  return row * job.scene.n_features;
 }
 
-template <typename T, bool kWithFeatures>
+// What the pixels of a group see of its rows: T, or Dual<T> along the tangents.
+template <typename V>
+struct Seen {
+  const Record<V>* records;  // [pairs]
+  RasterTangents<PlainOf<V>> tangents;
+};
+
+template <typename V, bool kWithFeatures>
 struct BlendShared {
-  Batch<T> batch;
-  Record<T> records[kWarp];  // of the next batch; a lane reads its own
+  Batch<V> batch;
+  Record<V> records[kWarp];  // of the next batch; a lane reads its own
   uint32_t pairs[kWarp];     // of the batch after it, the same
-  T features[kWithFeatures ? kFeatures : 1][kWarp];
+  V features[kWithFeatures ? kFeatures : 1][kWarp];
 };
 
 // A pixel on its way through the list.
-template <typename T>
+template <typename V>
 struct Light {
-  T rest;        // transmittance
-  T floor;       // alpha that counts: kMinAlpha, or kClosed when the pixel has ended
-  T sums[4];     // colour, depth
+  V rest;            // transmittance
+  PlainOf<V> floor;  // alpha that counts: kMinAlpha, or kClosed when the pixel has ended
+  V sums[4];         // colour, depth
   int32_t last;  // entries of the list in front of the pixel's end
 };
 constexpr double kClosed = 2;
 
 // One pass over the list: colour and depth, or (kPass = true) the features from `channel` on. A lane has two pixels,
 // one above the other, and visits the entries that either of them sees.
-template <typename T, bool kFade, bool kPass, bool kWithFeatures>
-__device__ void blend_quarter(const Job<T>& job, const RasterImages<T>& images, int64_t index, int64_t channel,
-                              BlendShared<T, kWithFeatures>& shared) {
+template <bool kFade, bool kPass, typename T, typename V, bool kWithFeatures>
+__device__ void blend_quarter(const Job<T>& job, const Seen<V>& seen, const RasterImages<T>& images, int64_t index,
+                              int64_t channel, BlendShared<V, kWithFeatures>& shared) {
   const RasterScene<T>& s = job.scene;
   const int lane = threadIdx.x % kWarp, column = lane % kQuarter, row = lane / kQuarter * kPixels;
   const Quarter quarter(job, index);
   const uint32_t* pairs = job.listed + job.lists[quarter.index].begin;
   const int n_channels = kPass ? static_cast<int>(min(s.n_features - channel, int64_t{kFeatures})) : 0;
-  Light<T> light[kPixels];
-  T features[kPixels][kFeatures];
+  Light<V> light[kPixels];
+  V features[kPixels][kFeatures];
 #pragma unroll
   for (int k = 0; k < kPixels; ++k) {
     light[k] = {T(1), T(pixel_of(s, quarter, column, row + k) < 0 ? kClosed : kMinAlpha), {}, quarter.n};
-    for (int c = 0; c < kFeatures; ++c) features[k][c] = 0;
+    for (int c = 0; c < kFeatures; ++c) features[k][c] = V(0);
   }
 
   // The records of a batch are fetched while the batch before is blended, their numbers another batch earlier. The
@@ -183,7 +197,7 @@ __device__ void blend_quarter(const Job<T>& job, const RasterImages<T>& images, 
   const int place = kWarp - 1 - lane;
   const auto number = [&](int32_t base) { return pairs + min(base + place, quarter.n - 1); };
   const auto fetch = [&](uint32_t pair, int32_t base) {
-    start_copy(job.records + pair, shared.records + lane);
+    start_copy(seen.records + pair, shared.records + lane);
     start_copy(number(base + kWarp), shared.pairs + lane);
   };
   uint32_t next_pair = 0;
@@ -194,7 +208,7 @@ __device__ void blend_quarter(const Job<T>& job, const RasterImages<T>& images, 
     if (__all_sync(kFullWarp, closed)) break;
     wait_copies();
     const uint32_t pair = next_pair;
-    Record<T> record;
+    Record<V> record;
     load_record(shared.records + lane, record);
     next_pair = shared.pairs[lane];
     uint32_t bits = 0;
@@ -206,8 +220,9 @@ __device__ void blend_quarter(const Job<T>& job, const RasterImages<T>& images, 
 #pragma unroll
       for (int row = 0; row < kQuarter; ++row) bits |= spans[row] << (row / kPixels * kQuarter);
       if constexpr (kPass) {
-        const T* row = features_of(job, quarter.image, pair) + channel;
-        for (int c = 0; c < kFeatures; ++c) shared.features[c][lane] = c < n_channels ? row[c] : T(0);
+        const int64_t at = features_of(job, quarter.image, pair) + channel;
+        for (int c = 0; c < kFeatures; ++c)
+          shared.features[c][lane] = c < n_channels ? argument<V>(s.features, seen.tangents.features, at + c) : V(0);
       }
     }
     __syncwarp();
@@ -217,22 +232,22 @@ __device__ void blend_quarter(const Job<T>& job, const RasterImages<T>& images, 
     while (mine) {
       const int j = kWarp - 1 - __clz(mine);
       mine ^= 1u << j;
-      const Batch<T>& batch = shared.batch;
-      T weight[kPixels], left[kPixels];
+      const Batch<V>& batch = shared.batch;
+      V weight[kPixels], left[kPixels];
       bool ends = false;
 #pragma unroll
       for (int k = 0; k < kPixels; ++k) {
-        const T raw = min_of(alpha_at(batch, j, x, y[k]), T(kMaxAlpha));
-        const T alpha = kFade ? fade(raw) : raw;
-        weight[k] = (kFade ? light[k].floor < 1 : raw >= light[k].floor) ? alpha * light[k].rest : T(0);
+        const V raw = min_of(alpha_at(batch, j, x, y[k]), V(kMaxAlpha));
+        const V alpha = kFade ? fade(raw) : raw;
+        weight[k] = (kFade ? light[k].floor < 1 : plain(raw) >= light[k].floor) ? alpha * light[k].rest : V(0);
         left[k] = light[k].rest - weight[k];
-        ends |= left[k] < T(kMinTransmittance);
+        ends |= plain(left[k]) < T(kMinTransmittance);
       }
       if (ends) {
 #pragma unroll
         for (int k = 0; k < kPixels; ++k) {
-          if (left[k] >= T(kMinTransmittance)) continue;
-          light[k].floor = kClosed, light[k].last = base + kWarp - 1 - j, weight[k] = 0, left[k] = light[k].rest;
+          if (plain(left[k]) >= T(kMinTransmittance)) continue;
+          light[k].floor = kClosed, light[k].last = base + kWarp - 1 - j, weight[k] = V(0), left[k] = light[k].rest;
         }
         if (light[0].floor > 1 && light[1].floor > 1) mine = 0;
       }
@@ -243,7 +258,7 @@ __device__ void blend_quarter(const Job<T>& job, const RasterImages<T>& images, 
           for (int c = 0; c < kFeatures; ++c) features[k][c] += weight[k] * shared.features[c][j];
         } else {
           const auto value = batch.values[j];
-          T(&sums)[4] = light[k].sums;
+          V(&sums)[4] = light[k].sums;
           sums[0] += weight[k] * value.red, sums[1] += weight[k] * value.green;
           sums[2] += weight[k] * value.blue, sums[3] += weight[k] * value.depth;
         }
@@ -258,28 +273,32 @@ __device__ void blend_quarter(const Job<T>& job, const RasterImages<T>& images, 
     if constexpr (kPass) {
       T* to = images.features + pixel * s.n_features + channel;
       for (int c = 0; c < kFeatures; ++c)
-        if (c < n_channels) to[c] = features[k][c];
+        if (c < n_channels) to[c] = shown(features[k][c]);
     } else {
-      const Light<T>& at = light[k];
+      const Light<V>& at = light[k];
       for (int c = 0; c < 3; ++c)
-        images.color[3 * pixel + c] = at.sums[c] + at.rest * background_of(s, quarter.image, c);
-      images.alpha[pixel] = 1 - at.rest;
-      images.depth[pixel] = at.sums[3];
-      images.transmittance[pixel] = at.rest;
-      images.last[pixel] = at.last;
+        images.color[3 * pixel + c] =
+            shown(at.sums[c] + at.rest * background_of<V>(s, quarter.image, c, seen.tangents.background));
+      images.alpha[pixel] = shown(V(1) - at.rest);
+      images.depth[pixel] = shown(at.sums[3]);
+      if constexpr (std::is_same_v<V, T>) {
+        images.transmittance[pixel] = at.rest;
+        images.last[pixel] = at.last;
+      }
     }
   }
   wait_copies();  // those of a list that was left before its end: the memory is used again
 }
 
-template <typename T, bool kFade, bool kWithFeatures>
-__device__ void blend_tiles(const Job<T>& job, const RasterImages<T>& images, BlendShared<T, kWithFeatures>& shared) {
+template <bool kFade, typename T, typename V, bool kWithFeatures>
+__device__ void blend_tiles(const Job<T>& job, const Seen<V>& seen, const RasterImages<T>& images,
+                            BlendShared<V, kWithFeatures>& shared) {
   for (WarpQuarters quarters(job); quarters.more(); quarters.next()) {
-    blend_quarter<T, kFade, false>(job, images, quarters.index(), 0, shared);
+    blend_quarter<kFade, false>(job, seen, images, quarters.index(), 0, shared);
     if constexpr (kWithFeatures) {
       for (int64_t channel = 0; channel < job.scene.n_features; channel += kFeatures) {
         __syncwarp();
-        blend_quarter<T, kFade, true>(job, images, quarters.index(), channel, shared);
+        blend_quarter<kFade, true>(job, seen, images, quarters.index(), channel, shared);
       }
     }
   }

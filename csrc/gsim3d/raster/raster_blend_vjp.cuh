@@ -149,7 +149,7 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
       T seen = -value_or_zero(grads.alpha, pixel);
       for (int c = 0; c < 3; ++c) {
         g[c] = value_or_zero(grads.color, 3 * pixel + c);
-        seen += g[c] * background_of(s, quarter.image, c);
+        seen += g[c] * background_of<T>(s, quarter.image, c);
         background_sums[c] += g[c] * at.light;
       }
       g[3] = value_or_zero(grads.depth, pixel);
@@ -192,7 +192,7 @@ __device__ void blend_quarter_vjp(const Job<T>& job, const RasterImageGrads<T>& 
     const T slope = record.slope;
     const T tight = record.tight * record.tight * T(1 / kLog2eHalf);  // of Footprint
     const T loose = record.loose * record.loose * T(1 / kLog2eHalf);
-    const T* entry_features = kWithFeatures && used ? features_of(job, quarter.image, pair) : nullptr;
+    const T* entry_features = kWithFeatures && used ? s.features + features_of(job, quarter.image, pair) : nullptr;
     int64_t slot = 0;
     if (used) {
       const PixelRect bounds{record.x0, record.x1, record.y0, record.y1};

@@ -41,14 +41,14 @@ __global__ void __launch_bounds__(kThreads, 1024 / kThreads) sort_kernel(Job<T> 
 
 template <typename T, bool kFade, bool kWithFeatures>
 __global__ void __launch_bounds__(kWarp, 32) blend_kernel(Job<T> job, RasterImages<T> images) {
-  blend_tiles<T, kFade>(job, images, of_warp<BlendShared<T, kWithFeatures>>());
+  blend_tiles<kFade>(job, Seen<T>{job.records}, images, of_warp<BlendShared<T, kWithFeatures>>());
 }
 
 template <typename T, bool kFade>
 __global__ void __launch_bounds__(kBlock) further_kernel(Job<T> first, Job<T> job, RasterImages<T> images) {
   if (!go_on(first, job)) return;
   while (next_group(job)) {
-    blend_tiles<T, kFade>(job, images, of_warp<BlendShared<T, true>>());
+    blend_tiles<kFade>(job, Seen<T>{job.records}, images, of_warp<BlendShared<T, true>>());
     cooperative_groups::this_grid().sync();
   }
 }

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "gsim3d/core/cuda_utils.cuh"
+#include "gsim3d/raster/raster_jet.h"
 
 namespace gsim3d::raster {
 
@@ -24,6 +25,11 @@ __device__ __forceinline__ float fast_reciprocal(float x) {
 __device__ __forceinline__ double fast_exp2(double x) { return exp2(x); }
 __device__ __forceinline__ double fast_sqrt(double x) { return sqrt(x); }
 __device__ __forceinline__ double fast_reciprocal(double x) { return 1 / x; }
+template <typename T>
+__device__ __forceinline__ Dual<T> fast_exp2(const Dual<T>& x) {
+  const T value = fast_exp2(x.value);
+  return dual(value, value * (T(0.5 / kLog2eHalf) * x.along[0]));  // times ln(2)
+}
 
 // Copies from global to shared memory. What is loaded ahead into registers under a condition is waited for at once, to
 // be merged with what was there; these are waited for in wait_copies, after which the calling thread sees its own.

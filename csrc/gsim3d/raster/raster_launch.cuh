@@ -151,15 +151,16 @@ __device__ bool go_on(const Job<T>& first, const Job<T>& job) {
   return true;
 }
 
-template <typename T>
-__device__ void project_any(const Job<T>& job) {
-  switch (job.scene.sh_terms) {
-    case kProjected: return project_rows<T, kProjected>(job, dynamic_memory);
-    case 0: return project_rows<T, 0>(job, dynamic_memory);
-    case 1: return project_rows<T, 1>(job, dynamic_memory);
-    case 4: return project_rows<T, 4>(job, dynamic_memory);
-    case 9: return project_rows<T, 9>(job, dynamic_memory);
-    default: return project_rows<T, 16>(job, dynamic_memory);
+// dispatch_sh within a kernel.
+template <typename F>
+__device__ void dispatch_terms(int64_t terms, const F& f) {
+  switch (terms) {
+    case kProjected: return f(std::integral_constant<int, kProjected>{});
+    case 0: return f(std::integral_constant<int, 0>{});
+    case 1: return f(std::integral_constant<int, 1>{});
+    case 4: return f(std::integral_constant<int, 4>{});
+    case 9: return f(std::integral_constant<int, 9>{});
+    default: return f(std::integral_constant<int, 16>{});
   }
 }
 
@@ -179,7 +180,8 @@ __device__ bool next_group(const Job<T>& job) {
   for (int64_t i = first + thread; i < last; i += int64_t{gridDim.x} * kBlock)
     job.slot_count[i] = 0, job.slot_cursor[i] = 0, job.list_cursor[i] = 0;
   grid.sync();
-  project_any(job);
+  dispatch_terms(job.scene.sh_terms,
+                 [&](auto terms) { project_rows<T, decltype(terms)::value>(job, dynamic_memory); });
   grid.sync();
   if (blockIdx.x == 0) find_offsets(job);
   grid.sync();

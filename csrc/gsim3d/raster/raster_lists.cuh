@@ -28,12 +28,13 @@ constexpr int kBinWidth = 64;  // entries
 constexpr int32_t kNoImage = INT32_MAX;
 
 // What a tile needs of one Gaussian in one image. alpha = 2^(strength - (tight u)^2 - (loose dy)^2), u = dx - slope dy.
-template <typename T>
+// V is T, or Dual<T> in forward mode.
+template <typename V>
 struct alignas(16) Record {
-  T x, y, slope, tight;  // pixels; tight and loose are square roots of Footprint's times log2(e) / 2
-  T loose, strength, z;
+  V x, y, slope, tight;  // pixels; tight and loose are square roots of Footprint's times log2(e) / 2
+  V loose, strength, z;
   uint16_t x0, x1;  // PixelRect
-  T red, green, blue;
+  V red, green, blue;
   uint16_t y0, y1;
 };
 

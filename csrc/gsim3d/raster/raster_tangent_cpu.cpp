@@ -5,24 +5,9 @@
 #include <cmath>
 #include <vector>
 
-#include "gsim3d/projection/jet.h"
 #include "gsim3d/raster/raster_check.h"
+#include "gsim3d/raster/raster_jet.h"
 #include "gsim3d/raster/raster_tiles.h"
-
-namespace gsim3d::raster {
-
-template <typename T>
-using Dual = projection::Jet<T, 1>;
-
-template <typename T>
-struct Lanes<Dual<T>> {
-  using Scalar = Dual<T>;
-  static constexpr int kCount = 1;
-  static Dual<T> splat(Dual<T> value) { return value; }
-  static Dual<T> sqrt(Dual<T> value) { return projection::root(value); }
-};
-
-}  // namespace gsim3d::raster
 
 namespace gsim3d::cpu {
 namespace {
@@ -30,49 +15,11 @@ namespace {
 using namespace raster;  // NOLINT: this is its other half
 
 template <typename T>
-Dual<T> dual(const T* values, const T* tangents, int64_t at) {
-  Dual<T> out(values[at]);
-  if (tangents) out.along[0] = tangents[at];
-  return out;
-}
-
-template <typename T>
 Dual<T> exponential(const Dual<T>& x) {
   Dual<T> out(std::exp(x.value));
   out.along[0] = out.value * x.along[0];
   return out;
 }
-
-// A row, and what an image makes of it.
-template <typename T, int kTerms>
-struct DualRow {
-  using D = Dual<T>;
-  static constexpr int kColumns = std::max(1, kTerms) * 3;
-  D mean[3], quat[4], scale[3], opacity, coefficients[kColumns], color[3];
-  Axes<D> axes;
-  Projection<D> projection;
-  Direction<D> direction;
-  Footprint<D> shape;
-  D basis[std::max(1, kTerms)];
-
-  DualRow(const RasterScene<T>& s, const RasterTangents<T>& t, const Camera<D>& camera, int64_t row) {
-    for (int i = 0; i < 3; ++i) mean[i] = dual(s.means, t.means, 3 * row + i);
-    for (int i = 0; i < 4; ++i) quat[i] = dual(s.quats, t.quats, 4 * row + i);
-    for (int i = 0; i < 3; ++i) scale[i] = dual(s.scales, t.scales, 3 * row + i);
-    for (int i = 0; i < kColumns; ++i) coefficients[i] = dual(s.color, t.color, kColumns * row + i);
-    opacity = dual(s.opacities, t.opacities, row);
-    axes = axes_of(quat, scale);
-    projection = project(camera, mean, axes);
-    shape = footprint_of(projection.xy, projection.yy, projection.determinant);
-    if constexpr (kTerms > 0) {
-      direction = view_direction(camera, projection.point);
-      sh_basis<kTerms>(direction.unit, basis);
-      sh_color<kTerms>(basis, coefficients, color);
-    } else {
-      for (int c = 0; c < 3; ++c) color[c] = coefficients[c];
-    }
-  }
-};
 
 // What a tile needs of one row in one image.
 template <typename T>
@@ -86,6 +33,7 @@ struct DualCall {
   const RasterTangents<T>& tangents;
   const RasterImageGrads<T>& grads;
   const RasterImages<T>& images;
+  const bool with_grads;
   std::vector<Dual<T>> slots;        // [n_instances, kSlotFixed + n_features]
   std::vector<DualSplat<T>> splats;  // [n_pairs]
 };
@@ -157,6 +105,7 @@ void blend_pixel(DualCall<T>& call, const std::vector<DualEntry<T>>& entries, in
   }
   call.images.alpha[pixel] = -light.along[0], call.images.depth[pixel] = sums[3].along[0];
   for (int64_t c = 0; c < n_features; ++c) call.images.features[pixel * n_features + c] = sums[4 + c].along[0];
+  if (!call.with_grads) return;
 
   // As blend_tile_vjp of raster_blend_cpu.cpp.
   const RasterImageGrads<T>& grads = call.grads;
@@ -222,16 +171,8 @@ void gather_row(const DualCall<T>& call, const Group<T>& group, const Camera<Dua
   for (int64_t c = 0; c < n_features; ++c) add(grads.features, row * n_features + c, sum[kSlotFixed + c]);
 }
 
-template <typename T>
-Camera<Dual<T>> dual_camera(const RasterScene<T>& s, const RasterTangents<T>& t, int64_t image) {
-  Dual<T> viewmat[16], K[9];
-  for (int i = 0; i < 16; ++i) viewmat[i] = dual(s.viewmats, t.viewmats, 16 * image + i);
-  for (int i = 0; i < 9; ++i) K[i] = Dual<T>(s.Ks[9 * image + i]);
-  return make_camera(viewmat, K, s.width, s.height, Dual<T>(s.near_plane), s.jacobian == RasterJacobian::kClamped);
-}
-
 template <typename T, int kTerms>
-void one_group(DualCall<T>& call, const Group<T>& group, const RasterSceneGrads<T>& grads, const Parallel& parallel) {
+void one_group(DualCall<T>& call, const Group<T>& group, const RasterSceneGrads<T>* grads, const Parallel& parallel) {
   using D = Dual<T>;
   const RasterScene<T>& s = call.scene;
   const auto n_chunks = static_cast<int64_t>(group.chunks.size());
@@ -257,15 +198,16 @@ void one_group(DualCall<T>& call, const Group<T>& group, const RasterSceneGrads<
       for (int64_t x = x0; x < std::min(s.width, x0 + kTile); ++x)
         blend_pixel(call, entries, image, x, y, backgrounds.data() + 3 * task);
   });
+  if (!grads) return;
   for (int64_t task = 0; task < n_tasks; ++task)
     for (int c = 0; c < 3; ++c)
-      grads.background[3 * (group.first + task / n_tiles) + c] += backgrounds[3 * task + c].along[0];
+      grads->background[3 * (group.first + task / n_tiles) + c] += backgrounds[3 * task + c].along[0];
   for (const Chunk& chunk : group.chunks) {  // one after the other: images add to the same rows
     D viewmat[12] = {};
     const Camera<D> camera = dual_camera(s, call.tangents, chunk.image);
     for (int64_t row = chunk.begin; row < chunk.end; ++row)
-      gather_row<T, kTerms>(call, group, camera, chunk.pair + row - chunk.begin, row, grads, viewmat);
-    for (int i = 0; i < 12; ++i) grads.viewmats[16 * chunk.image + i] += viewmat[i].along[0];
+      gather_row<T, kTerms>(call, group, camera, chunk.pair + row - chunk.begin, row, *grads, viewmat);
+    for (int i = 0; i < 12; ++i) grads->viewmats[16 * chunk.image + i] += viewmat[i].along[0];
   }
 }
 
@@ -274,15 +216,15 @@ void one_group(DualCall<T>& call, const Group<T>& group, const RasterSceneGrads<
 template <typename T>
 void raster_tangent(const RasterScene<T>& scene, const RasterTangents<T>& tangents,
                     const RasterImageGrads<T>& image_grads, const RasterImages<T>& images,
-                    const RasterSceneGrads<T>& grads, const Workspace& workspace, const Parallel& parallel) {
+                    const RasterSceneGrads<T>* grads, const Workspace& workspace, const Parallel& parallel) {
   check_scene(scene);
-  clear_grads(scene, grads);
+  if (grads) clear_grads(scene, *grads);
   Scratch scratch(workspace);
   Group<T> group;
   while (next_group(scene, true, scratch, parallel, group)) {
-    DualCall<T> call{scene, tangents, image_grads, images, {}, {}};
+    DualCall<T> call{scene, tangents, image_grads, images, grads != nullptr, {}, {}};
     call.splats.resize(static_cast<size_t>(group.n_pairs()));
-    call.slots.resize(static_cast<size_t>(group.n_instances * (kSlotFixed + scene.n_features)));
+    if (grads) call.slots.resize(static_cast<size_t>(group.n_instances * (kSlotFixed + scene.n_features)));
     dispatch_sh(scene.sh_terms, [&](auto terms) {
       constexpr int kTerms = decltype(terms)::value;
       if constexpr (kTerms >= 0) one_group<T, kTerms>(call, group, grads, parallel);
@@ -292,7 +234,7 @@ void raster_tangent(const RasterScene<T>& scene, const RasterTangents<T>& tangen
 
 #define GSIM3D_INSTANTIATE(T)                                                                                   \
   template void raster_tangent<T>(const RasterScene<T>&, const RasterTangents<T>&, const RasterImageGrads<T>&,  \
-                                  const RasterImages<T>&, const RasterSceneGrads<T>&, const Workspace&,         \
+                                  const RasterImages<T>&, const RasterSceneGrads<T>*, const Workspace&,         \
                                   const Parallel&);
 GSIM3D_INSTANTIATE(float)
 GSIM3D_INSTANTIATE(double)

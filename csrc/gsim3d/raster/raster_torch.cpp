@@ -191,6 +191,70 @@ SceneGrads rasterize_gaussians_backward(const Tensor& grad_color, const Tensor& 
           grad_in_color, grad_in_features, grad_background, grad_viewmats};
 }
 
+// A direction of the differentiable arguments of a scene, contiguous and checked against them.
+struct TangentTensors {
+  std::vector<Tensor> tensors;
+
+  TangentTensors(const SceneTensors& in, std::initializer_list<const Tensor*> given) {
+    const Tensor* values[] = {&in.means, &in.quats, &in.scales, &in.opacities, &in.color, &in.features, &in.background,
+                              &in.viewmats};
+    for (const Tensor* tangent : given) {
+      const Tensor& t = tensors.emplace_back(rows_of(*tangent));
+      check(t.sizes().equals(values[tensors.size() - 1]->sizes()), in.op,
+            ": tangents must have the shapes of their tensors");
+      check_dtype(in.op, "tangents", t, in.means.scalar_type());
+      check_device(in.op, "tangents", t, in.means);
+    }
+  }
+
+  template <typename T>
+  RasterTangents<T> tangents() const {
+    const auto& t = tensors;
+    return {data<T>(t[0]), data<T>(t[1]), data<T>(t[2]), data<T>(t[3]),
+            data<T>(t[4]), data<T>(t[5]), data<T>(t[6]), data<T>(t[7])};
+  }
+};
+
+using TangentImages = std::tuple<Tensor, Tensor, Tensor, Tensor>;
+
+TangentImages rasterize_gaussians_tangent(
+    const Tensor& t_means, const Tensor& t_quats, const Tensor& t_scales, const Tensor& t_opacities,
+    const Tensor& t_color, const Tensor& t_features, const Tensor& t_background, const Tensor& t_viewmats,
+    const Tensor& state, const Tensor& means, const Tensor& quats, const Tensor& scales, const Tensor& opacities,
+    const Tensor& color, const Tensor& features, const Tensor& background, const Tensor& viewmats, const Tensor& Ks,
+    const Tensor& image_cloud, const Tensor& cu_rows, int64_t width, int64_t height, double near_plane, int64_t cutoff,
+    int64_t jacobian, int64_t max_pairs, int64_t max_entries, int64_t max_slots, const std::optional<Tensor>& active) {
+  const char* op = "rasterize_gaussians_tangent";
+  const SceneTensors given{op, means, quats, scales, opacities, color, features, background,
+                           viewmats, Ks, image_cloud, cu_rows, width, height, near_plane, cutoff, jacobian, active};
+  given.check_all();
+  const SceneTensors in = given.contiguous();
+  const TangentTensors along(in, {&t_means, &t_quats, &t_scales, &t_opacities, &t_color, &t_features, &t_background,
+                                  &t_viewmats});
+  const Tensor kept = rows_of(state);
+  check_dtype(op, "state", kept, ScalarType::Byte);
+  check_device(op, "state", kept, in.means);
+  const int64_t n = in.n_images();
+  Tensor out_color = empty(in.means, {n, height, width, 3}), alpha = empty(in.means, {n, height, width});
+  Tensor depth = empty(in.means, {n, height, width});
+  Tensor out_features = empty(in.means, {n, height, width, in.features.size(1)});
+  TensorWorkspace workspace(in.means);
+  dispatch_float(op, "means", in.means, [&]<typename T>() {
+    const RasterImages<T> images{mutable_data<T>(out_color), mutable_data<T>(alpha), mutable_data<T>(depth),
+                                 mutable_data<T>(out_features), nullptr, nullptr, nullptr};
+    if constexpr (kWithCuda)
+      if (in.means.is_cuda()) {
+        const RasterScene<T> scene = in.scene<T>();
+        const cuda::RasterLimits limits{max_pairs, max_entries, max_slots};
+        check_shape(op, "state", kept, {cuda::raster_state_bytes(scene, limits)}, "[bytes]");
+        return cuda::raster_tangent<T>(scene, along.tangents<T>(), images, limits, kept.data_ptr(), workspace,
+                                       current_stream(in.means));
+      }
+    cpu::raster_tangent<T>(in.scene<T>(), along.tangents<T>(), {}, images, nullptr, workspace, torch_parallel());
+  });
+  return {out_color, alpha, depth, out_features};
+}
+
 // Of the images and of every gradient, along the tangents.
 using Tangents = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
                             Tensor>;
@@ -206,21 +270,13 @@ Tangents rasterize_gaussians_backward_tangent(
   const char* op = "rasterize_gaussians_backward_tangent";
   const SceneTensors given{op, means, quats, scales, opacities, color, features, background,
                            viewmats, Ks, image_cloud, cu_rows, width, height, near_plane, cutoff, jacobian, active};
-  const Tensor* tangents_[] = {&t_means, &t_quats, &t_scales, &t_opacities, &t_color, &t_features, &t_background,
-                               &t_viewmats};
   const Tensor* image_grads_[] = {&grad_color, &grad_alpha, &grad_depth, &grad_features};
   given.check_all();
   const SceneTensors in = given.contiguous();
   check(!in.means.is_cuda(), op, ": the rasterizer has no derivative of this order on CUDA; use tensors on the CPU");
-  std::vector<Tensor> tangents, image_grads;
-  const Tensor* values[] = {&in.means, &in.quats, &in.scales, &in.opacities, &in.color, &in.features, &in.background,
-                            &in.viewmats};
-  for (size_t i = 0; i < 8; ++i) {
-    tangents.push_back(rows_of(*tangents_[i]));
-    check(tangents[i].sizes().equals(values[i]->sizes()), op, ": tangents must have the shapes of their tensors");
-    check_dtype(op, "tangents", tangents[i], in.means.scalar_type());
-    check_device(op, "tangents", tangents[i], in.means);
-  }
+  const TangentTensors along(in, {&t_means, &t_quats, &t_scales, &t_opacities, &t_color, &t_features, &t_background,
+                                  &t_viewmats});
+  std::vector<Tensor> image_grads;
   const int64_t n = in.n_images(), n_features = in.features.size(1);
   std::vector<Tensor> out{empty(in.means, {n, height, width, 3}), empty(in.means, {n, height, width}),
                           empty(in.means, {n, height, width}), empty(in.means, {n, height, width, n_features})};
@@ -230,12 +286,9 @@ Tangents rasterize_gaussians_backward_tangent(
     check_dtype(op, "image_grads", image_grads[i], in.means.scalar_type());
     check_device(op, "image_grads", image_grads[i], in.means);
   }
-  for (const Tensor* value : values) out.push_back(empty(*value, value->sizes()));
+  for (const Tensor& tangent : along.tensors) out.push_back(empty(tangent, tangent.sizes()));
   TensorWorkspace workspace(in.means);
   dispatch_float(op, "means", in.means, [&]<typename T>() {
-    const auto& t = tangents;
-    const RasterTangents<T> along{data<T>(t[0]), data<T>(t[1]), data<T>(t[2]), data<T>(t[3]),
-                                  data<T>(t[4]), data<T>(t[5]), data<T>(t[6]), data<T>(t[7])};
     const RasterImages<T> images{mutable_data<T>(out[0]), mutable_data<T>(out[1]), mutable_data<T>(out[2]),
                                  mutable_data<T>(out[3]), nullptr, nullptr, nullptr};
     const RasterImageGrads<T> of_images{data<T>(image_grads[0]), data<T>(image_grads[1]), data<T>(image_grads[2]),
@@ -243,7 +296,7 @@ Tangents rasterize_gaussians_backward_tangent(
     const RasterSceneGrads<T> grads{mutable_data<T>(out[4]), mutable_data<T>(out[5]),  mutable_data<T>(out[6]),
                                     mutable_data<T>(out[7]), mutable_data<T>(out[8]),  mutable_data<T>(out[9]),
                                     mutable_data<T>(out[10]), mutable_data<T>(out[11])};
-    cpu::raster_tangent<T>(in.scene<T>(), along, of_images, images, grads, workspace, torch_parallel());
+    cpu::raster_tangent<T>(in.scene<T>(), along.tangents<T>(), of_images, images, &grads, workspace, torch_parallel());
   });
   return {out[0], out[1], out[2], out[3], out[4], out[5], out[6], out[7], out[8], out[9], out[10], out[11]};
 }
@@ -251,6 +304,7 @@ Tangents rasterize_gaussians_backward_tangent(
 void kernels(auto& m) {
   m.impl("rasterize_gaussians", TORCH_BOX(&rasterize_gaussians));
   m.impl("rasterize_gaussians_backward", TORCH_BOX(&rasterize_gaussians_backward));
+  m.impl("rasterize_gaussians_tangent", TORCH_BOX(&rasterize_gaussians_tangent));
   m.impl("rasterize_gaussians_backward_tangent", TORCH_BOX(&rasterize_gaussians_backward_tangent));
 }
 

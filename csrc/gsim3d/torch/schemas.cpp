@@ -165,7 +165,15 @@ STABLE_TORCH_LIBRARY(gsim3d, m) {
       "max_slots, bool viewmats_grad, Tensor? active=None) -> (Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor color, "
       "Tensor features, Tensor background, Tensor viewmats)");
 
-  // Derivatives along the tangents t_*, on the CPU: of the four images, and of all gradients that those of images give.
+  // Derivatives of the four images along the tangents t_*.
+  m.def(
+      "rasterize_gaussians_tangent(Tensor t_means, Tensor t_quats, Tensor t_scales, Tensor t_opacities, Tensor "
+      "t_color, Tensor t_features, Tensor t_background, Tensor t_viewmats, Tensor state, Tensor means, Tensor quats, Tensor "
+      "scales, Tensor opacities, Tensor color, Tensor features, Tensor background, Tensor viewmats, Tensor Ks, Tensor "
+      "image_cloud, Tensor cu_rows, int width, int height, float near_plane, int cutoff, int jacobian, SymInt "
+      "max_pairs, SymInt max_entries, SymInt max_slots, Tensor? active=None) -> (Tensor color, Tensor alpha, Tensor "
+      "depth, Tensor features)");
+  // On the CPU also of all gradients that those of images give.
   m.def(
       "rasterize_gaussians_backward_tangent(Tensor means, Tensor quats, Tensor scales, Tensor opacities, Tensor color, "
       "Tensor features, Tensor background, Tensor viewmats, Tensor Ks, Tensor image_cloud, Tensor cu_rows, Tensor "
