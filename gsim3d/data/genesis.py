@@ -20,6 +20,7 @@ from gsim3d.errors import InputError, naming
 NAME = "genesis"
 FILE = "metadata.json"
 DEFAULTS = {"fps": 42.0, "near": 1.0, "far": 8.0}  # of the published data sets, whose metadata has none of them
+KEYS = ("n_steps", "n_cams", "file_path_template", *DEFAULTS, "origin", "bounds")
 TEMPLATE_FIELDS = {"cam_ix", "n_step", "img_type"}
 
 
@@ -32,6 +33,7 @@ def read(folder: Path, problems: Problems) -> Recording:
     """Reads the scene in ``folder``. Raises InputError if its description cannot be parsed."""
     source = folder / FILE
     metadata = Description(recording.read_json(source), f"{source}: ", problems)
+    metadata.refuse_misspelt(KEYS)
     n_steps = metadata.whole("n_steps", recording.MAX_STEPS)
     n_cams = metadata.whole("n_cams", recording.MAX_CAMS)
     template = _template(metadata)
@@ -88,10 +90,8 @@ def _template(metadata: Description) -> str:
         parts = [part for part in string.Formatter().parse(template) if part[1] is not None]
     fields = {field for _, field, _, _ in parts}
     if fields != TEMPLATE_FIELDS:
-        raise InputError(
-            f"{where} must use exactly the fields {', '.join(sorted(TEMPLATE_FIELDS))}; "
-            f"got {', '.join(sorted(fields)) or 'none'}"
-        )
+        wanted, given = (", ".join(sorted(some)) or "none" for some in (TEMPLATE_FIELDS, fields))
+        raise InputError(f"{where} must use exactly the fields {wanted}; got {given}")
     # Only plain fields and zero-padded integers: a format width of 10^9 would exhaust memory.
     for _, field, spec, conversion in parts:
         if conversion or not re.fullmatch(r"" if field == "img_type" else r"(0?\d{1,2})?d?", spec):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,6 +18,7 @@ from gsim3d.io.files import MAX_TEXT, read_file
 
 MAX_STEPS, MAX_CAMS, MAX_SIZE = 1_000_000, 10_000, 16_384  # larger values are rejected as errors
 MAX_NUMBER = 1e9  # metres, pixels, seconds; larger values are rejected as errors
+NEAR_NAME, MAX_OTHERS = 0.8, 100  # similarity at which a key is taken for a misspelt one, and keys that are compared
 MAX_NAME = 200  # characters of a file name
 HALF_PAIR = re.compile(r"\\u[dD][89a-fA-F]")  # JSON escape of a surrogate, possibly unpaired
 SPACING_TOLERANCE, MAX_ROUNDING = 0.05, 0.25  # largest deviation from even spacing in steps, of times rounded to ms
@@ -139,6 +141,14 @@ class Description:
     where: str  #: prefix of error messages, such as "metadata.json: cam_0."
     problems: Problems  #: receives the errors found
 
+    def refuse_misspelt(self, known: Sequence[str]) -> None:
+        """Raises InputError if a key resembles one of ``known``, or has such a word in it, and is none of them."""
+        for key in sorted(set(self.values).difference(known))[:MAX_OTHERS]:
+            lower, words = key[:100].lower(), {"fps", "offset", "near", "far"}.intersection(known)
+            meant = [word for word in known if sorted(word) == sorted(lower) or word in words & {*lower.split("_")}]
+            if meant := difflib.get_close_matches(lower, known, 1, NEAR_NAME) or meant:
+                raise InputError(f"{self.where}{key:.80} is no key of this file; did you mean {meant[0]}?")
+
     def whole(self, key: str, limit: int) -> int:
         """Returns an integer from 1 to ``limit``; 1 on error."""
         value = self.values.get(key)
@@ -150,12 +160,10 @@ class Description:
     def positive(self, key: str) -> float | None:
         """Returns a positive number; None if absent or on error."""
         value = self.values.get(key)
-        if value is None:
-            return None
-        if not _is_number(value) or not 0 < value <= MAX_NUMBER:
+        if value is not None and not (_is_number(value) and 0 < value <= MAX_NUMBER):
             self.problems.add(f"{self.where}{key} must be a positive number, at most {MAX_NUMBER:g}; got {value!r:.80}")
-            return None
-        return float(value)
+            value = None
+        return None if value is None else float(value)
 
     def array(self, key: str, *shapes: tuple[int, ...]) -> np.ndarray | None:
         """Returns a finite float64 array of one of ``shapes``; None on error."""
@@ -164,12 +172,10 @@ class Description:
     def size(self, key: str) -> tuple[int, int]:
         """Returns (width, height) of an image; (1, 1) on error."""
         size = self.array(key, (2,))
-        if size is None:
-            return 1, 1
-        if (size != np.round(size)).any() or (size < 1).any() or (size > MAX_SIZE).any():
+        if size is not None and not ((size == np.round(size)) & (size >= 1) & (size <= MAX_SIZE)).all():
             self.problems.add(f"{self.where}{key} must be [width, height] in pixels; got {size.tolist()}")
-            return 1, 1
-        return int(size[0]), int(size[1])
+            size = None
+        return (1, 1) if size is None else (int(size[0]), int(size[1]))
 
     def workspace(self, near: float | None = None, far: float | None = None, unit: float = 1.0) -> dict[str, Any]:
         """Returns the keys common to all layouts, near, far, origin and bounds, in metres.

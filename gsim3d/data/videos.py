@@ -7,7 +7,6 @@ Labels come from the folders labels or masks, or else from alpha, or else from b
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -27,7 +26,6 @@ FILE = "cameras.json"
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".webm", ".mov", ".avi", ".m4v")
 SHARED_KEYS = ("fps", "resample", "units", "near", "far", "origin", "bounds", "masks", "pixel_center", "cameras")
 KEYS = (*SHARED_KEYS, "name", "size", "K", "R", "T", "offset", "distortion", "camera_model", "is_fisheye")
-NEAR_NAME, MAX_OTHERS = 0.8, 100  # similarity at which a key is taken for a misspelt one, and keys that are compared
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 DISTORTIONS = [(4,), (5,), (8,)]
 OWN_FOLDERS = ("masks", "labels")  # reserved, not camera names
@@ -103,20 +101,15 @@ def _entries(description: Description) -> dict[str, Description]:
         name = entry.get("name")
         plain = isinstance(name, str) and 0 < len(name) <= recording.MAX_NAME and Path(name).name == name
         if not plain or "\0" in name or name in OWN_FOLDERS or name.startswith("."):
-            raise InputError(
-                f"{description.where}cameras[{number}].name must be the name of its folder or video, without ending; "
-                f"got {str(name)[:80]!r}"
-            )
+            where = f"{description.where}cameras[{number}].name"
+            raise InputError(f"{where} must be the name of its folder or video, without ending; got {str(name)[:80]!r}")
         if name in found:
             raise InputError(f"{description.where}two cameras have the same name: {name}")
         values, where = {**shared, **entry}, f"{description.where}camera {name}: "
         if misplaced := next((key for key in SHARED_KEYS if key in entry), None):
             raise InputError(f"{where}{misplaced} belongs to the top level: all cameras have the same")
-        for key in sorted(set(values).difference(KEYS))[:MAX_OTHERS]:
-            words = [word for word in key[:100].split("_") if word in ("fps", "offset", "near", "far")]
-            if meant := difflib.get_close_matches(key[:100], KEYS, 1, NEAR_NAME) or words:
-                raise InputError(f"{where}{key:.80} is no key of this file; did you mean {meant[0]}?")
         found[name] = Description(values, where, description.problems)
+        found[name].refuse_misspelt(KEYS)
     return found
 
 

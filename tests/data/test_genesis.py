@@ -43,6 +43,15 @@ def test_genesis_default_frame_rate_of_an_own_file_is_noted(tmp_path):
     assert Scene.open(tmp_path / "published").recording.notes == ()
 
 
+@pytest.mark.parametrize(
+    "key, meant", [("naer", "near"), ("far_plane", "far"), ("Orgin", "origin"), ("bound", "bounds")]
+)
+def test_genesis_misspelt_keys_are_refused(tmp_path, key, meant):
+    write_scene(tmp_path, edits={key: 1.0})
+    with pytest.raises(InputError, match=f"metadata.json: {key} is no key of this file; did you mean {meant}?"):
+        Scene.open(tmp_path)
+
+
 def test_genesis_cameras_equal_the_metadata(tmp_path):
     """Extrinsics are world-to-camera, intrinsics stay in pixels with the full principal point."""
     write_scene(tmp_path)
