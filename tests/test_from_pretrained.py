@@ -104,6 +104,9 @@ def test_speed_is_read_beside_the_weights(folder):
         ({"steps": 0}, "steps must be a whole number of at least 1; got 0"),
         ({"steps": 1.5}, "steps must be a whole number of at least 1; got 1.5"),
         ({"source": "data/ball/0000"}, r"source must be a scene \(gsim3d.data.Scene.open.*got str"),
+        ({"edits": "throw.yaml"}, r"edits must be a list of .*Edit\(step, operation\); got 'throw.yaml'"),
+        ({"edits": Edit(0, Remove("frozen"))}, r"edits must be a list of .*; got Edit\("),
+        ({"edits": [Edit(0, "remove")]}, r"edits must be a list of .*; got \[Edit\("),
         ({"cameras": [0]}, r"cameras must be Cameras.*got \[0\]"),
         (
             {"inputs": dataclasses.replace(INPUTS, image_size=(32, 48))},
@@ -115,7 +118,7 @@ def test_predictions_that_are_refused(simulator, change, message):
     simulator.inputs = change.get("inputs", INPUTS)
     with pytest.raises(InputError, match=message):
         source = change.get("source", make_frames((2,)))
-        simulator.predict(source, change.get("steps", 1), cameras=change.get("cameras"))
+        simulator.predict(source, change.get("steps", 1), cameras=change.get("cameras"), edits=change.get("edits", ()))
 
 
 def test_checkpoints_that_are_refused(folder):

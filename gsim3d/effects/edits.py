@@ -22,7 +22,7 @@ from torch.nn import functional as F
 
 from gsim3d.effects.selection import Selection, Vector, newest_mask
 from gsim3d.effects.spec import StructureEffects
-from gsim3d.errors import InputError, check_one_of, naming
+from gsim3d.errors import InputError, check_one_of, check_whole, naming
 from gsim3d.io.files import read_yaml, shown
 from gsim3d.io.settings import from_dict
 from gsim3d.math.rotations import quat_product, rotate_left, rotation_matrices
@@ -174,8 +174,7 @@ class Recolor(Operation):
     def apply(self, state: Particles, colors: Colors) -> Particles:
         chosen = self.of.mask(state)
         newest = chosen & newest_mask(state)
-        grey = state.means.new_tensor(GREY)
-        mean = (colors(state)[newest] @ grey).mean().clamp(min=DARKEST)
+        mean = (colors(state)[newest] @ (grey := state.means.new_tensor(GREY))).mean().clamp(min=DARKEST)
         paint = torch.outer(state.means.new_tensor(self.color) / mean, grey).expand(state.n_rows, 3, 3)
         if state.sh is not None:
             return _changed(state, chosen, {"sh": painted(state.sh, paint)})
@@ -223,8 +222,7 @@ class Insert(Operation):
         for field, value in given.row_fields().items():
             mine = getattr(state, field)
             if not ATTRIBUTES[field].is_optional and (mine is None or mine.shape[1:] != value.shape[1:]):
-                wanted = "insert particles of the same model"
-                raise InputError(f"particles.{field} differs in shape from the state; {wanted}")
+                raise InputError(f"particles.{field} differs in shape from the state; insert those of the same model")
         given = given.select_rows(chosen).to(state.means.device)
         table, steps = state.clouds, given.clouds.steps
         newest = {table.scenes[q]: table.steps[q] for q in newest_clouds(table)}
@@ -278,7 +276,7 @@ def by_step(edits: Iterable[Edit], n_steps: int, *, insert: bool, remove: bool) 
         InputError: a step is out of range, or an edit adds or removes particles although this is off.
     """
     found: dict[int, list[Edit]] = {}
-    for edit in sorted(edits, key=lambda edit: edit.step):
+    for edit in sorted(_listed(edits), key=lambda edit: edit.step):
         if not 0 <= edit.step < n_steps:
             raise InputError(f"{edit.where}: the rollout has steps 0 to {n_steps - 1}")
         for asked, on, name in ((edit.operation.inserts, insert, "insert"), (edit.operation.removes, remove, "remove")):
@@ -290,8 +288,15 @@ def by_step(edits: Iterable[Edit], n_steps: int, *, insert: bool, remove: bool) 
 
 def structure_of(edits: Iterable[Edit]) -> StructureEffects:
     """Structure effects of a spec that allows ``edits``."""
-    operations = [edit.operation for edit in edits]
+    operations = [edit.operation for edit in _listed(edits)]
     return StructureEffects(any(o.inserts for o in operations), any(o.removes for o in operations))
+
+
+def _listed(edits: Iterable[Edit]) -> list[Edit]:
+    found = list(edits) if isinstance(edits, Iterable) else [None]
+    if not all(isinstance(one, Edit) and isinstance(one.operation, Operation) for one in found):
+        raise InputError(f"edits must be a list of gsim3d.effects.edits.Edit(step, operation); got {shown(edits)}")
+    return found
 
 
 def load_edits(path: str | Path, encode: Callable[[Path], Particles]) -> list[Edit]:
@@ -309,10 +314,8 @@ def load_edits(path: str | Path, encode: Callable[[Path], Particles]) -> list[Ed
 def _edit(values: Any, where: str, folder: Path, encode: Callable[[Path], Particles]) -> Edit:
     if not isinstance(values, dict):
         raise InputError(f"{where} must be a mapping; got {shown(values)}")
-    values = dict(values)
-    step, op = values.pop("step", None), values.pop("op", None)
-    if isinstance(step, bool) or not isinstance(step, int):
-        raise InputError(f"{where}: step must be a whole number; got {shown(step)}")
+    step, op = (values := dict(values)).pop("step", None), values.pop("op", None)
+    check_whole(f"{where}: step", step, 0)
     check_one_of(f"{where} at step {step}: op", op, OPERATIONS)
     where = f"{where} at step {step}, {op}"
     kind, given = OPERATIONS[op], {}
@@ -343,8 +346,7 @@ def _attributes(state: Particles, kind: str) -> dict[str, Tensor]:
 
 def _centers(state: Particles, chosen: Tensor) -> Tensor:
     """Mean position [N, 3] of the ``chosen`` particles in the newest cloud of each particle's scene."""
-    scene = state.row_scene()
-    chosen = chosen & newest_mask(state)
+    scene, chosen = state.row_scene(), chosen & newest_mask(state)
     one = F.one_hot(scene, int(scene.max()) + 1).to(state.means)
     sums = (one * chosen[:, None]).mT @ torch.cat([state.means, torch.ones_like(state.means[:, :1])], 1)
     return (sums[:, :3] / sums[:, 3:].clamp(min=1))[scene]

@@ -271,7 +271,7 @@ def test_files(tmp_path):
     [
         ("step: 0", "must hold a list; got dict"),
         ("- 3", "edit 0 must be a mapping; got 3"),
-        ("- {op: move}", "edit 0: step must be a whole number; got None"),
+        ("- {op: move}", "edit 0: step must be a whole number of at least 0; got None"),
         ("- {step: 2, op: [move]}", "edit 0 at step 2: op must be one of remove, move"),
         ("- {step: 2, op: explode}", "edit 0 at step 2: op must be one of remove, move"),
         ("- {step: 2, op: move, to: [0, 0, 1]}", "edit 0 at step 2, move: to: unknown setting; known here: of, by"),
