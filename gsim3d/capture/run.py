@@ -24,11 +24,11 @@ from gsim3d.data.check import check_scene
 from gsim3d.data.layouts import layout_of
 from gsim3d.data.recording import read_json
 from gsim3d.data.videos import FILE
-from gsim3d.errors import InputError
+from gsim3d.errors import InputError, check_one_of
 from gsim3d.evaluate.protocol import score_scene
 from gsim3d.io.files import sha256_of, write_whole
 from gsim3d.io.settings import from_dict, to_dict
-from gsim3d.nn.multiview_encoder.config import ViTConfig
+from gsim3d.nn.multiview_encoder.config import BACKBONES
 from gsim3d.pretrained.loading import check_device
 from gsim3d.train.config import DataConfig, LossConfig, OptimizerConfig, PhaseConfig, TrainConfig
 from gsim3d.train.log import LOG
@@ -84,7 +84,7 @@ def capture(
         raise InputError(f"{folder} is not a folder")
     check_device(device)
     if depth:
-        ViTConfig(depth[0])  # raises if there is no such model
+        check_one_of("--depth: MODEL", depth[0], BACKBONES)
         if not Path(depth[1]).is_file():
             raise InputError(f"--depth: {depth[1]}: no such file")
         depth = depth[0], str(Path(depth[1]).resolve())

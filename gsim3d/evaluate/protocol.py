@@ -81,17 +81,12 @@ def default_views(
         cameras = [cam for cam in context_cameras(scene, data) if cam not in (target or ())]
         context = spread_views(cameras, min(data.context_views, len(cameras)), 0)
     if len(set(context)) < least:
-        raise InputError(
-            f"{scene.path}: {len(set(context))} cameras left as inputs; training used {trained} views (set inputs with "
-            "--context, each once)"
-        )
+        left = f"{len(set(context))} cameras left as inputs; training used {trained} views"
+        raise InputError(f"{scene.path}: {left} (set inputs with --context, each once)")
     if len(context) < trained:
-        warnings.warn(
-            f"fitted to the model: {len(context)} input views, cameras {' '.join(map(str, context))}; training used "
-            f"{trained} (set inputs with --context)",
-            FitWarning,
-            stacklevel=2,
-        )
+        given = f"{len(context)} input view{'s' * (len(context) > 1)}, cameras {' '.join(map(str, context))}"
+        warning = f"fitted to the model: {given}; training used {trained} (set inputs with --context)"
+        warnings.warn(warning, FitWarning, stacklevel=2)
     if not target:
         rest = tuple(cam for cam in range(scene.n_cams) if cam not in context)
         target = data.target_only_cameras or rest or context

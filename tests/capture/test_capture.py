@@ -12,7 +12,7 @@ import torch
 from safetensors.torch import save_file
 
 from gsim3d.capture import check, prepare
-from gsim3d.capture.run import _Run
+from gsim3d.capture.run import _Run, capture
 from gsim3d.cli.main import main
 from gsim3d.data import Scene, find_scenes
 from gsim3d.data.masks import background_image, foreground
@@ -141,6 +141,11 @@ def test_every_take_is_checked(tmp_path, monkeypatch):
     write_take(tmp_path / "videos" / "b", n_frames=16)
     with pytest.raises(InputError, match=r"videos/b: has cameras .*\(80, 80\).* pixels, other takes .*\(96, 96\)"):
         run.check()
+
+
+def test_an_unknown_model_of_depth_is_refused_by_its_option(tmp_path):
+    with pytest.raises(InputError, match="^--depth: MODEL must be one of tiny, .*; got 'dinov2_smal'; did you mean"):
+        capture(tmp_path, tmp_path / "run", depth=("dinov2_smal", "weights.safetensors"))
 
 
 def test_depths_are_those_of_the_cameras_of_each_take(tmp_path):
