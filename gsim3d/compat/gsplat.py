@@ -143,6 +143,8 @@ def rasterization(
     optional |= {"radial_coeffs": radial_coeffs, "tangential_coeffs": tangential_coeffs}
     optional |= {"colors": colors, "backgrounds": backgrounds} if with_color else {}
     check_whole(OP, width=width, height=height)
+    if not (0 < width < 2**16 and 0 < height < 2**16):
+        raise ValueError(f"{OP}: width and height must be in [1, 65535]; got {width} and {height}")
     check_real(OP, eps2d=eps2d)
     if not 0 <= eps2d < math.inf:
         raise ValueError(f"{OP}: eps2d must be finite and not negative; got {eps2d}")
@@ -157,11 +159,13 @@ def rasterization(
     shapes = (None, None) if covars is not None else (quats.flatten(0, -2), scales.flatten(0, -2))
     limits = {"near_plane": near_plane, "far_plane": far_plane, "radius_clip": radius_clip, "dilation": eps2d}
     options = {"lens": lens, "distortion": distortion, "jacobian": "clamped", "antialiased": antialiased, **limits}
-    options["covars"] = None if covars is None else covars.flatten(0, -3)
-    flat_opacities = opacities.flatten()
-    projection = project_gaussians(
-        means.flatten(0, -2), *shapes, cameras, opacities=flat_opacities, n_clouds=n_batches, check=False, **options
-    )
+    flat_opacities, flat_covars = opacities.flatten(), None if covars is None else covars.flatten(0, -3)
+    options |= {"covars": flat_covars, "opacities": flat_opacities, "n_clouds": n_batches, "check": False}
+    try:
+        projection = project_gaussians(means.flatten(0, -2), *shapes, cameras, **options)
+    except (ValueError, TypeError) as error:  # of cameras, size and planes, which are looked at there
+        error.args = (str(error).replace("project_gaussians", OP, 1),)
+        raise
     values = _colors(colors, sh_degree, means, viewmats) if with_color else means.new_zeros(n_images * n, 0)
     alphas = flat_opacities if n_cameras == 1 else opacities[..., None, :].expand(*batch, n_cameras, n).reshape(-1)
     alphas = alphas * projection.compensations if antialiased else alphas

@@ -347,7 +347,7 @@ def test_bad_numbers_are_named_on_a_cpu(batch):
         rasterization(**arguments, **SIZE, backgrounds=backgrounds)
     with pytest.raises(ValueError, match="rasterization: colors must be float64, as means, or of 16 bits"):
         rasterization(**arguments | {"colors": arguments["colors"].float()}, **SIZE)
-    with pytest.raises(ValueError, match="width and height must be positive"):
+    with pytest.raises(ValueError, match="rasterization: width and height must be in"):
         rasterization(**arguments, width=0, height=4)
     for eps2d, error in ((-1.0, ValueError), (math.nan, ValueError), ("0.3", TypeError)):
         with pytest.raises(error, match="rasterization: eps2d must be"):

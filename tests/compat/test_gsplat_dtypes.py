@@ -1,5 +1,7 @@
 """gsplat's call: what is cast, and what is not under autocast."""
 
+import math
+
 import pytest
 import torch
 
@@ -32,3 +34,18 @@ def test_16_bit_rows_under_autocast_leave_cameras_as_they_are(sh_degree):
         again, *_ = rasterization(**arguments, **SIZE, sh_degree=sh_degree)
     assert_close_relative_to_max(color, expected, 1e-6)
     assert_same_bits(again, wide)
+
+
+WRONG = [
+    ({"width": 0}, "width and height must be"), ({"height": 70_000}, "width and height must be"),
+    ({"near_plane": -1.0}, "near_plane must not be negative"), ({"far_plane": 0.0}, "near_plane must not be negative"),
+    ({"far_plane": "x"}, "far_plane must be a number"), ({"radius_clip": math.nan}, "radius_clip must be finite"),
+    ({"Ks": torch.zeros(2, 3, 3, dtype=torch.float64)}, "focal lengths in Ks must be positive"),
+    ({"viewmats": torch.full((2, 4, 4), 1e20, dtype=torch.float64)}, "viewmats"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("given", "message"), WRONG, ids=[next(iter(given)) for given, _ in WRONG])
+def test_errors_of_cameras_size_and_planes_name_the_call(given, message):
+    with pytest.raises((ValueError, TypeError), match=f"^rasterization: {message}"):
+        rasterization(**scene_of() | SIZE | given)
