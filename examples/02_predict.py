@@ -14,6 +14,8 @@ from gsim3d import Simulator
 from gsim3d.data import Scene
 from gsim3d.io import write_splats
 
+if len(sys.argv) != 3 or sys.argv[1].startswith("-"):
+    sys.exit(__doc__)
 folder, out = sys.argv[1], Path(sys.argv[2])
 out.mkdir(parents=True, exist_ok=True)
 

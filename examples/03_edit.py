@@ -12,6 +12,8 @@ from gsim3d.data import Scene
 from gsim3d.effects.edits import Edit, Move, Recolor, Throw
 from gsim3d.state import DYNAMIC
 
+if len(sys.argv) != 2 or sys.argv[1].startswith("-"):
+    sys.exit(__doc__)
 simulator = Simulator.from_pretrained("elastic-small")
 scene = Scene.open(sys.argv[1])
 

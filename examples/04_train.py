@@ -11,6 +11,8 @@ from gsim3d.data import Scene, find_scenes
 from gsim3d.train.config import DataConfig, PhaseConfig, TrainConfig
 from gsim3d.train.loop import Trainer
 
+if len(sys.argv) != 3 or sys.argv[1].startswith("-"):
+    sys.exit(__doc__)
 data, out = sys.argv[1:3]
 
 config = TrainConfig(

@@ -17,6 +17,8 @@ from gsim3d.state import DYNAMIC, concatenate
 
 SPEED, REACH = 6.0, 0.8  # rad/s and metres of the arm
 
+if len(sys.argv) != 2 or sys.argv[1].startswith("-"):
+    sys.exit(__doc__)
 simulator = Simulator.from_pretrained("elastic-small")
 scene = Scene.open(sys.argv[1])
 with torch.no_grad():  # the history: a ball and its copy, both falling

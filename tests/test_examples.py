@@ -54,6 +54,16 @@ def test_example_runs(example, folder):
         assert float(re.findall(r"PSNR ([\d.]+) dB", output)[-1]) > 20
 
 
+@pytest.mark.parametrize("example", ARGUMENTS)
+def test_examples_say_what_they_take(example, folder):
+    for given in ([], ["--help"]):
+        command = [sys.executable, str(ROOT / "examples" / f"{example}.py"), *given]
+        env = {**os.environ, "PYTHONPATH": str(ROOT)}
+        done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 1 and "Traceback" not in done.stderr, done.stderr
+        assert f"python examples/{example}.py " in done.stderr
+
+
 def test_a_scene_is_fitted_by_both_packages(tmp_path):
     (tmp_path / "gsplat.py").write_text("from gsim3d.compat.gsplat import rasterization\n")
     start = (
