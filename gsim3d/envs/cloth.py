@@ -81,9 +81,7 @@ def _start(angle: float):
         f'<body name="g{i}" mocap="true" pos="{-half * c - side * s:.9g} {-half * s + side * c:.9g} {HELD}"/>'
         for i, side in enumerate((-half, half))
     )
-    held = "".join(
-        f'<connect body1="g{i}" body2="cloth_{vertex}" anchor="0 0 0"/>' for i, vertex in enumerate((0, COUNT - 1))
-    )
+    held = [f'<connect body1="g{i}" body2="cloth_{vertex}" anchor="0 0 0"/>' for i, vertex in enumerate((0, COUNT - 1))]
     spacing = f"{WIDTH / (COUNT - 1):.9g}"
     model = mujoco.MjModel.from_xml_string(f"""<mujoco>
   <option timestep="{1 / (FPS * SUBSTEPS):.12g}" integrator="discrete" iterations="100"/>
@@ -95,7 +93,7 @@ def _start(angle: float):
         <elasticity young="{YOUNG}" poisson="{POISSON}" thickness="{THICKNESS}" damping="{DAMPING}" elastic2d="both"/>
         <contact selfcollide="none" solref="{CONTACT_TIME} 1"/>
       </flexcomp></body></worldbody>
-  <equality>{held}</equality>
+  <equality>{"".join(held)}</equality>
 </mujoco>""")
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

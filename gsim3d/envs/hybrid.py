@@ -98,9 +98,8 @@ class HybridScene:
         mujoco.mj_kinematics(self.model, self.data)
         check_solver(self.data)
         after, turns = self.data.xpos[self._bodies], self.data.xquat[self._bodies]
-        moved = torch.from_numpy(after - before)
-        actors = [Actor(one[None], ActorRows(number=number)) for number, one in enumerate(moved)]
-        step = self.simulator.rollout(self.state, 1, self.plan, actors=actors)[0]
+        moved = [Actor(by[None], ActorRows(number=i)) for i, by in enumerate(torch.from_numpy(after - before))]
+        step = self.simulator.rollout(self.state, 1, self.plan, actors=moved)[0]
         for number, (old, new) in enumerate(zip(turned, turns, strict=True)):
             local, turn = np.zeros(3), np.zeros(3)  # rotation vectors, in the body's frame before and in the world
             mujoco.mju_subQuat(local, new, old)

@@ -242,16 +242,14 @@ class ModelScenes(Scenes):
     def _frames(self, started: Mapping[int, Start]) -> tuple[Frames, Tensor]:
         """Input frames, and the label of each pixel: a body, then an actor, else negative."""
         views = [view for start in started.values() for view in start.views]
-        clouds = torch.arange(len(views), device=self.device)
-        scenes = torch.tensor(list(started), device=self.device)
         images, segments, labels = (
             torch.from_numpy(np.concatenate([getattr(view, name) for view in views])).to(self.device)
             for name in ("rgb", "segmentation", "instances")
         )
         frames = Frames(
             images=images.permute(0, 3, 1, 2).float().div_(255),
-            cameras=_cameras(self.rig, clouds.repeat_interleave(self.rig.n_cams)),
-            cloud_scene=scenes.repeat_interleave(self.history),
+            cameras=_cameras(self.rig, torch.arange(len(views), device=self.device).repeat_interleave(self.rig.n_cams)),
+            cloud_scene=torch.tensor(list(started), device=self.device).repeat_interleave(self.history),
             cloud_step=torch.arange(self.history, device=self.device).repeat(len(started)),
             origin=torch.from_numpy(cameras.workspace_origin(self.rig)).to(self.device).expand(self.count, 3),
             masks=segments != render.BACKGROUND,

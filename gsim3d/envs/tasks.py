@@ -72,7 +72,9 @@ class TaskEnv(gymnasium.Env):
         return self._episodes.goals[0].cpu().numpy()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        """The first observation of a new episode, and ``info``."""
+        """The first observation of a new episode, and ``info``. Raises InputError where ``options`` are given."""
+        if options:
+            raise InputError(f"reset: a single environment has no options; got {shown(options)}")
         super().reset(seed=seed)
         self._episodes.begin({0: self.np_random})
         return self._observe(), self._info()
@@ -153,7 +155,8 @@ class Episodes:
     ):
         for name in unknown:
             options = "observation", "image_size", "render_mode", "backend", "model", "device"
-            raise InputError(f"{task.__name__} has no option {name!r}{did_you_mean(name, options)}")
+            known = f"it has {', '.join(options)}{did_you_mean(name, options)}"
+            raise InputError(f"{task.__name__} has no option {name!r}; {known}")
         check_one_of("observation", observation, OBSERVATIONS)
         check_one_of("backend", backend, BACKENDS)
         check_one_of("render_mode", render_mode or RENDER_MODES[0], RENDER_MODES)
@@ -313,6 +316,8 @@ class TaskVectorEnv(VectorEnv):
         seed = np.asarray(seed).tolist()  # of an array, too, Python's integers
         if not isinstance(seed, list):
             seed = [seed + i if isinstance(seed, int) else seed for i in range(self.num_envs)]
+        if unknown := set(options or {}) - {"reset_mask"}:
+            raise InputError(f"reset: the options have reset_mask alone; got {shown(sorted(map(str, unknown)))}")
         chosen = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, bool)))
         if len(seed) != self.num_envs or chosen.shape != (self.num_envs,) or chosen.dtype != bool:
             raise InputError(f"seed and reset_mask must be of {self.num_envs} environments")

@@ -159,8 +159,15 @@ def test_wrong_actions_are_refused(action):
 def test_wrong_options_are_refused(options):
     with pytest.raises(InputError, match=next(iter(options))):
         PushToGoal(**options)
-    with pytest.raises(InputError, match="PushToGoal has no option 'modle'; did you mean model?"):
+    with pytest.raises(InputError, match="PushToGoal has no option 'modle'; it has .*; did you mean model?"):
         gymnasium.make_vec("gsim3d/PushToGoal-v0", num_envs=2, modle="push")
+
+
+def test_options_of_a_reset_are_not_ignored():
+    with pytest.raises(InputError, match="reset: a single environment has no options; got {'goal'"):
+        PushToGoal().reset(options={"goal": (0.0, 0.0)})
+    with pytest.raises(InputError, match="reset: the options have reset_mask alone; got .'mask'"):
+        gymnasium.make_vec("gsim3d/PushToGoal-v0", num_envs=2).reset(options={"mask": [True, False]})
 
 
 def test_vector_environments_of_gymnasium_take_scenes_with_different_numbers_of_bodies():
