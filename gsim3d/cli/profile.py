@@ -5,7 +5,8 @@ sleep, patch and grid size, ... For each setting, it measures the error against 
 float32) and against the video, and the time of a step by section. Written to DIR: report.html (one page, needs no
 network), report.json, report.csv and the figures as PNG. Written to the checkpoint: speeds.json, with the fastest
 settings that retain 99.9 % ("balanced") and 99 % ("fast") of the reference's gain over the constant baseline, for
---speed, and the times of the reference, from which `gsim3d plan` predicts milliseconds.
+--speed, and the times of the reference, from which `gsim3d plan` predicts milliseconds. Where --settings or --minutes
+leave settings out, speeds that the checkpoint has already are kept: those measured are written to DIR/speeds.json.
 An interrupted command continues when it is run again with the same DIR.
 
 examples:
@@ -33,8 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--preset", choices=("quick", "full"), default="quick", help="number of measurements (default: quick)")
     add("--settings", nargs="+", metavar="NAME", help="groups of settings to measure (default: all)")
     add("--metrics", nargs="+", metavar="METRIC", help="scores against the video, as in gsim3d evaluate")
-    limit = "approximate time budget; the report lists skipped settings (default: no limit)"
-    add("--minutes", type=number(0, 1e6, above=True), metavar="M", help=limit)
+    add("--minutes", type=number(0, 1e6, above=True), metavar="M", help="approximate time limit (default: none)")
     add("--device", choices=("cpu", "cuda"), default="cpu", help="where to simulate (default: cpu)")
     add("--quiet", action="store_true", help="no progress bar")
 

@@ -20,7 +20,7 @@ from gsim3d.evaluate.scoring import METRICS, measurable
 from gsim3d.io.files import write_whole
 from gsim3d.io.machine import machine
 from gsim3d.io.terminal import in_columns
-from gsim3d.numerics.speed import SPEEDS_FILE
+from gsim3d.numerics.speed import SPEEDS_FILE, read_checkpoints
 from gsim3d.pretrained import folder_of
 from gsim3d.profile.autotune import PROMISES, part_times, save_speeds, tune
 from gsim3d.profile.settings import GROUPS, KINDS, Group
@@ -107,7 +107,7 @@ def profile(
         sweep.run(points)
         if points[0].failure:
             raise InputError(f"{checkpoint}: the reference run failed: {points[0].failure}")
-        for point in (point for point in points if point.failure == NO_TIME):
+        for point in (left_out := [point for point in points if point.failure == NO_TIME]):
             before = not_run.get(point.group, "a larger --minutes, for")
             not_run[point.group] = f"{before} {point.setting.name};"
         points = [point for point in points if point.failure != NO_TIME]
@@ -122,7 +122,8 @@ def profile(
             "not_measured": {**case.not_measured, **not_measured},
         }
         files = write(out, case, points, presets, content)
-        files.append(_keep_speeds(folder_of(checkpoint), out, restored, presets, part_times(case, points[0])))
+        times, is_partial = part_times(case, points[0]), bool(settings or left_out)
+        files.append(_keep_speeds(folder_of(checkpoint), out, is_partial, restored, presets, times))
     return content, files
 
 
@@ -145,18 +146,22 @@ def generated(checkpoint: str, restored: Restored, folder: Path, n_steps: int) -
 
 
 def _scenes(restored: Restored, data: str, which: str, count: int | None) -> list[Scene]:
-    folders = find_scenes(data)
-    folders = folders if which == "all" else split_scenes(folders)[1] or folders
-    return [restored.open_scene(folder) for folder in folders[:count]]
+    found = find_scenes(data)
+    chosen = found if which == "all" else split_scenes(found)[1] or found
+    return [restored.open_scene(folder) for folder in chosen[:count]]
 
 
-def _keep_speeds(folder: Path, out: Path, *kept) -> Path:
-    """Saves the presets in the checkpoint's ``folder``, which ``--speed`` reads, or in ``out`` if it is read-only."""
+def _keep_speeds(folder: Path, out: Path, is_partial: bool, restored: Restored, *kept) -> Path:
+    """Saves presets in the checkpoint's ``folder``, for ``--speed``; in ``out`` if it is read-only or has better."""
+    known = read_checkpoints(folder / SPEEDS_FILE).get(restored.checkpoint.digest, {})
+    if is_partial and restored.device.type in known:
+        print(f"{folder / SPEEDS_FILE}: kept, as only some settings were measured; theirs: {out / SPEEDS_FILE}")
+        return save_speeds(out, restored, *kept)
     try:
-        return save_speeds(folder, *kept)
+        return save_speeds(folder, restored, *kept)
     except OSError as error:
         print(f"{error.filename or folder}: {error.strerror}; for --speed, copy {out / SPEEDS_FILE} there")
-        return save_speeds(out, *kept)
+        return save_speeds(out, restored, *kept)
 
 
 def as_dict(case: BenchmarkCase, points: Sequence[Point], presets: dict[str, Point]) -> dict:

@@ -69,23 +69,20 @@ def check_scenes(scenes: Sequence[Scene], data: DataConfig, phases: Sequence[Pha
     for scene in scenes:
         first = scenes[0]
         if (scene.width, scene.height) != (first.width, first.height):
-            raise InputError(
-                f"{scene.path}: images of {scene.width}x{scene.height} pixels, those of {first.path} have "
-                f"{first.width}x{first.height}; set data.resize"
-            )
+            own, other = f"{scene.width}x{scene.height} pixels", f"{first.width}x{first.height}; set data.resize"
+            raise InputError(f"{scene.path}: images of {own}, those of {first.path} have {other}")
         if frame_stride(scene.fps, first.fps) != 1 and min(scene.n_steps, first.n_steps) > 1:
-            raise InputError(
-                f"{scene.path}: {scene.fps:g} frames per second, {first.path} has {first.fps:g}; rates must be equal"
-            )
+            own = f"{scene.path}: {scene.fps:g} frames per second"
+            raise InputError(f"{own}, {first.path} has {first.fps:g}; rates must be equal")
         for phase in phases:
             n_steps = (phase.history or data.history) + phase.horizon
             if scene.n_steps < n_steps:
-                too_long = f"windows of {n_steps} steps do not fit: lower history or horizon"
-                raise InputError(f"{scene.path}: {scene.n_steps} steps; {too_long}")
+                own = f"{scene.path}: {scene.n_steps} steps"
+                raise InputError(f"{own}; windows of {n_steps} steps do not fit: lower history or horizon")
             if not data.leave_one_out and scene.n_cams - data.targets_apart * data.context_views < phase.target_views:
                 raise InputError(f"{scene.path}: {scene.n_cams} cameras; {phase.target_views} target views do not fit")
-        if len(context_cameras(scene, data)) < data.context_views:
-            raise InputError(f"{scene.path}: too few cameras for {data.context_views} context views")
+        if (given := len(context_cameras(scene, data))) < (wanted := data.context_views):
+            raise InputError(f"{scene.path}: {given} cameras may be inputs; lower data.context_views ({wanted})")
 
 
 def context_cameras(scene: Scene, data: DataConfig) -> list[int]:
@@ -93,9 +90,7 @@ def context_cameras(scene: Scene, data: DataConfig) -> list[int]:
     allowed = data.context_cameras or range(scene.n_cams)
     for name in ("context_cameras", "target_only_cameras"):
         if bad := [cam for cam in getattr(data, name) or () if not 0 <= cam < scene.n_cams]:
-            raise InputError(
-                f"{scene.path}: camera {bad[0]} of data.{name} does not exist; the scene has {scene.n_cams}"
-            )
+            raise InputError(f"{scene.path}: has {scene.n_cams} cameras; camera {bad[0]} of data.{name} does not exist")
     return sorted(set(allowed) - set(data.target_only_cameras))
 
 

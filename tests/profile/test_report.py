@@ -135,6 +135,14 @@ def test_command_lists_settings_skipped_by_time_limit(arguments, tmp_path):
     }
 
 
+def test_some_settings_do_not_replace_tuned_speeds(arguments, run, tmp_path, capsys):
+    tuned = json.dumps({checkpoint.load(run).digest: {"cpu": {"fast": {"history": 1}}}})
+    (run / SPEEDS_FILE).write_text(tuned)
+    assert main([*arguments, "--minutes", "1e-4"]) == 0
+    assert (run / SPEEDS_FILE).read_text() == tuned and (tmp_path / "out" / SPEEDS_FILE).is_file()
+    assert ": kept, as only some settings were measured" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("name, world", [("cloth-small", "cloth"), ("runs/own", "elastic")])
 def test_scenes_are_generated_for_the_model(name, world, case, tmp_path, monkeypatch):
     asked = []
