@@ -245,6 +245,13 @@ def test_full_disk_error_names_the_path(tmp_path, capsys, monkeypatch):
     assert done.returncode == 2 and done.stderr == "gsim3d: error: sheet.png: File too large\n"
 
 
+def test_full_disk_behind_the_output_is_named():
+    command = [sys.executable, "-m", "gsim3d", "train", "--print-config"]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert done.returncode != 0 and "<stdout>: No space left" in done.stderr, done.stderr
+
+
 @pytest.mark.parametrize("processes", [1, 2])
 def test_full_disk_error_of_generate(tmp_path, processes):
     made = ["generate", "elastic", "--size", "16", "--frames", "2", "--trajectories", "2", "--out", "made", "--quiet"]
