@@ -3,7 +3,7 @@
 The first steps of every scene are the input; the others are predicted and compared with the video from cameras that
 were not an input. Metrics: psnr (all pixels), psnr_masked (foreground), psnr_body (movable bodies), psnr_ground (the
 rest of the foreground), psnr_ring (ground near bodies, where shadows fall), ssim, lpips_alex, lpips_vgg and fvd.
-Methods:
+Of generated scenes also momentum, energy, rigidity, penetration and permanence, by step. Methods:
 
   model              the checkpoint
   constant           its last encoded particles, constant; shows the gain of the dynamics
@@ -98,7 +98,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out",
         metavar="FILE",
         help="JSON file (default: metrics.json in the folder of the checkpoint or predictions, or, for a shipped "
-        "simulator, in the current folder)",
+        "simulator, in the current folder, where none may exist)",
     )
 
 

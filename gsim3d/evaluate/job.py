@@ -14,7 +14,7 @@ from gsim3d.evaluate.predictions import Predictions
 from gsim3d.evaluate.protocol import check_cameras, default_views, horizon, score_scenes
 from gsim3d.evaluate.report import markdown, summarize, table, write_csv, write_json
 from gsim3d.evaluate.scoring import SceneScores, measurable
-from gsim3d.io.files import output_path, with_parents, write_whole
+from gsim3d.io.files import new_output_path, output_path, with_parents, write_whole
 from gsim3d.numerics.trust import trust_of
 from gsim3d.pretrained import FOLDER, folder_of
 from gsim3d.synth.held_out import set_of
@@ -153,7 +153,7 @@ def _report_path(job: Job, others: list[Predictions]) -> Path:
         return output_path(job.out, ".json")
     place = folder_of(job.checkpoint) if job.checkpoint else Path(others[0].folder if job.predictions else "")
     if place.is_relative_to(FOLDER):  # the installed package is not written to
-        return Path("metrics.json")
+        return new_output_path("metrics.json", "file")
     return place / "metrics.json"
 
 
