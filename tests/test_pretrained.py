@@ -15,6 +15,7 @@ from gsim3d.numerics.speed import SPEEDS_FILE
 from gsim3d.numerics.trust import TRUST_FILE
 from gsim3d.testing.invariances import INVARIANCES
 from gsim3d.train.restore import restore
+from tests.tiny_scenes import write_scenes
 
 PARTS = {"model.safetensors", "config.yaml", "training.jsonl", "recipe.json", "scores.json", "README.md"}
 FIELDS = [
@@ -37,7 +38,7 @@ def test_name_is_the_simulator_and_a_path_the_file(folder, monkeypatch):
     assert pretrained.names() == ["ball-tiny"]
     assert pretrained.located("ball-tiny") == folder / "ball-tiny" / pretrained.WEIGHTS
     monkeypatch.chdir(folder)
-    assert pretrained.located("ball-tiny") == pretrained.Path("ball-tiny")  # there is a folder of this name here
+    assert pretrained.located("ball-tiny") == pretrained.Path("ball-tiny", pretrained.WEIGHTS)
     assert pretrained.located(folder) == folder
 
 
@@ -108,3 +109,17 @@ def test_other_checkpoints_have_no_known_failures(folder):
 def test_shipped_files_are_small():
     sizes = [(pretrained.FOLDER / name / pretrained.WEIGHTS).stat().st_size for name in pretrained.names()]
     assert sum(sizes) <= MOST_BYTES
+
+
+def test_a_folder_of_a_shipped_simulator_is_a_checkpoint():
+    name = pretrained.names()[0]
+    assert checkpoint.load(pretrained.FOLDER / name).digest == checkpoint.load(name).digest
+
+
+def test_evaluate_keeps_a_report_of_a_shipped_simulator(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "metrics.json").write_text("kept")
+    write_scenes(tmp_path / "data", 1)
+    assert main(["evaluate", pretrained.names()[0], "data", "--scenes", "all"]) == 2
+    assert "--out: metrics.json exists already" in capsys.readouterr().err
+    assert (tmp_path / "metrics.json").read_text() == "kept"

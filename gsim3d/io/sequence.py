@@ -42,8 +42,7 @@ def open_sequence(target: str | Path, up: str | None = None) -> Sequence:
     Raises:
         InputError: there are none, or they are of several formats.
     """
-    target = Path(target)
-    if target.is_file():
+    if (target := Path(target)).is_file():
         return Sequence((target,), up=up)
     if not target.is_dir():
         raise InputError(f"{target}: no such file or folder")
@@ -51,7 +50,8 @@ def open_sequence(target: str | Path, up: str | None = None) -> Sequence:
     files = sorted(path for path in folder.iterdir() if path.is_file() and _suffix(path))
     kinds = sorted({_suffix(path) for path in files})
     if len(kinds) != 1:
-        found = f"files of several formats: {', '.join(kinds)}" if kinds else "no file of Gaussians"
+        none = "no file of Gaussians (of a data set, view a scene)"
+        found = f"files of several formats: {', '.join(kinds)}" if kinds else none
         raise InputError(f"{folder}: {found}; formats: {', '.join(FORMATS)}")
     return Sequence(tuple(files), _fps(folder / ABOUT), up)
 

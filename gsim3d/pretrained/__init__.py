@@ -36,7 +36,7 @@ def located(checkpoint: str | Path) -> Path:
     """
     path = Path(checkpoint)
     if path.exists():
-        return path
+        return path / WEIGHTS if (path / WEIGHTS).is_file() and not (path / "state.json").exists() else path
     if str(checkpoint) in names():
         return FOLDER / str(checkpoint) / WEIGHTS
     known = f"shipped simulators: {', '.join(names()) or 'none'}"

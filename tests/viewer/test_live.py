@@ -194,7 +194,7 @@ def test_run_is_opened_with_its_rate_and_the_truth_beside_it(run, scene):
         ({"target": "run", "start": 2}, "without --scene"),
         ({"target": "run", "scene": "scene", "start": 6}, "--start 6: .* 6 steps"),
         ({"target": "scene", "up": "y"}, "--scene and --up belong"),
-        ({"target": "."}, "no file of Gaussians"),
+        ({"target": "."}, r"no file of Gaussians \(of a data set, view a scene\)"),
     ],
 )
 def test_open_target_names_what_is_wrong(options, message, run, scene, tmp_path, monkeypatch):
