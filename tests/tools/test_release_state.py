@@ -329,6 +329,7 @@ def test_an_arm_begins_with_the_state_of_another(first_run, store, tmp_path):
     assert begun_with(state, NAME, NAME)[1].scores and begun_with(state, "ball-other", "")[0] == "ball-other"
     with pytest.raises(InputError, match="--begin-with"):
         begun_with(state, "ball-other", "ball-none")
+    assert begun_with(state, "cube-velocity", NAME) == (NAME, Progress())  # of another world: the weights alone
     config = dataclasses.replace(CONFIG, model={"dynamics": {"mlp_ratio": 4, "time_embedding": False}})
     other = RunTrainer(config, store, tmp_path / "other", "cpu")
     first = {name: value.clone() for name, value in other.parameters.items()}

@@ -69,7 +69,8 @@ def load_progress(folder: str | Path, name: str) -> Progress:
 
 
 def begun_with(folder: str | Path, name: str, first: str) -> tuple[str, Progress]:
-    """The run whose state run ``name`` goes on from, and the progress there: its own, or else ``first``, if not "".
+    """The run whose state run ``name`` goes on from, and the progress there: its own, or else ``first``, if not "". Of
+    another world only the weights are taken.
 
     Raises:
         InputError: there is no state of ``first``, where it is needed, or a state is damaged.
@@ -78,6 +79,8 @@ def begun_with(folder: str | Path, name: str, first: str) -> tuple[str, Progress
         return name, load_progress(folder, name)
     if not state_file(folder, first).is_file():
         raise InputError(f"{state_file(folder, first)}: does not exist; --begin-with needs it")
+    if first.partition("-")[0] != name.partition("-")[0]:
+        return first, Progress()
     return first, dataclasses.replace(load_progress(folder, first), scores=[])  # which are of another model
 
 

@@ -66,6 +66,8 @@ def run(
         with DataWorkers(world, store, progress.next_trajectory, workers, scratch, together) as made:
             trainer = RunTrainer(recipe.train, store, Path(scratch) / "run", device, together)
             load_into(trainer, state, source, differs=source != name)
+            if not progress.step:  # of another world
+                trainer.step, trainer.seconds, trainer.n_skipped = 0, 0.0, 0
             report(f"{name}: waits for {recipe.n_first} trajectories of {workers} data workers")
             if not made.wait_for(-(-recipe.n_first // together.count), end - time.monotonic()):
                 raise InputError(f"--minutes: {minutes:g} pass before {recipe.n_first} trajectories are made")
@@ -157,7 +159,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cuda")
     parser.add_argument("--workers", type=int, help="data workers (default: all cores but three for each GPU)")
     parser.add_argument("--last", action="store_true", help="the learning rate falls: the last run of a simulator")
-    parser.add_argument("--begin-with", metavar="ARM", help="whose state is taken where the own arm has none")
+    parser.add_argument("--begin-with", metavar="NAME", help="run whose state is taken where the own has none")
     parser.add_argument("--commit", default="", help="of the code that runs, for the state")
     args = parser.parse_args(arguments)
     if not args.minutes > 0:
@@ -167,7 +169,7 @@ def main(arguments: list[str] | None = None) -> None:
     together = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     workers = args.workers or len(os.sched_getaffinity(0)) - SPARE_CORES * together
     options = {"minutes": args.minutes, "device": args.device, "workers": max(1, workers // together)}
-    options |= {"first": f"{args.world}-{args.begin_with}" if args.begin_with else "", "is_last": args.last}
+    options |= {"first": args.begin_with or "", "is_last": args.last}
     run(recipe(args.world, args.arm), args.state, args.out, about={"commit": args.commit}, **options)
 
 
