@@ -44,7 +44,8 @@ def main(arguments: list[str] | None = None) -> int:
         try:
             return _command(arguments)
         finally:
-            sys.stdout.flush()
+            with contextlib.suppress(OSError):  # of a full disk, said before
+                sys.stdout.flush()
 
 
 def command(name: str) -> tuple[Any, Parser]:
@@ -67,7 +68,9 @@ def _command(arguments: list[str]) -> int:
             warnings.showwarning = partial(_show_warning, warnings.showwarning)
             module, parser = command(name)
             args = parser.parsed(arguments[1:])
-            return module.run(args) or 0
+            code = module.run(args) or 0
+            sys.stdout.flush()
+            return code
     except (InputError, NumericalError, CaptureError) as error:
         return _fail(str(error))
     except RunStopped as error:

@@ -42,11 +42,11 @@ class Terminal:
         try:
             action()
         except OSError as error:
-            if error.errno not in (errno.EPIPE, errno.EIO):
-                raise OSError(error.errno, error.strerror, self._stream.name) from None
             self._is_open = False
             with open(os.devnull, "wb") as nothing:  # where what Python still holds goes at the end
                 os.dup2(nothing.fileno(), self._stream.fileno())
+            if error.errno not in (errno.EPIPE, errno.EIO):
+                raise OSError(error.errno, error.strerror, self._stream.name) from None
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)

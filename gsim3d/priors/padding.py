@@ -13,7 +13,6 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from gsim3d.ops.curve import curve_encode, curve_sort
 from gsim3d.ops.validate_state import CELLS
 from gsim3d.state import DYNAMIC, Particles, constant
 
@@ -108,28 +107,37 @@ def _take_flat(values: Tensor, *indices: Tensor) -> Tensor:
     return _Take.apply(values.reshape(*values.shape[:2], -1), *indices).reshape(len(values), -1, *values.shape[2:])
 
 
-class Samples(Compact):
-    """All members of a subset or, of larger subsets, ``SAMPLES`` of them at even intervals along a Hilbert curve.
-
-    Their choice depends on the order of rows only between members at the same position, which may differ in values.
+class Samples:
+    """All members of a subset or, of larger subsets, ``SAMPLES`` of them at even intervals.
 
     Attributes:
         n: int64 [B], number of members.
+        known: bool [B, S], False for padding.
         positions: [B, S, 3] in metres, 0 for padding.
         mean: mean position [B, 3].
     """
 
     def __init__(self, subset: Subset):
-        super().__init__(subset.known, SAMPLES)
-        self.n = subset.known.sum(1)
-        if subset.known.shape[1] > SAMPLES:
-            order, ranks = _along_curve(subset.positions, subset.known, self.n > SAMPLES)
-            n, k = self.n.clamp(min=SAMPLES)[:, None], torch.arange(SAMPLES, device=self.n.device)
-            self._at = order.gather(1, k * n // SAMPLES)
-            self._rank = ((ranks * SAMPLES + n - 1) // n).clamp(max=SAMPLES - 1)
-            self._mask = subset.known & (self._rank * n // SAMPLES == ranks)
-        self.positions = self.take(subset.positions)
+        self._rows, self._mask, self._until = subset.rows, subset.known, subset.known.cumsum(1)
+        self.n = self._until[:, -1]
+        k = torch.arange(SAMPLES, device=self.n.device)
+        self.known = k < self.n[:, None]
+        self._at = torch.searchsorted(self._until, self._rank(k) + 1).clamp(max=self._until.shape[1] - 1)
+        positions = subset.positions.gather(1, self._at[:, :, None].expand(-1, -1, 3))
+        self.positions = torch.where(self.known[:, :, None], positions, 0)
         self.mean = self.mean_of(self.positions)
+
+    def _rank(self, k: Tensor) -> Tensor:
+        """Rank of sample ``k`` among the members."""
+        n = self.n[:, None]
+        return torch.where(n > SAMPLES, k * n // SAMPLES, k)
+
+    def take(self, values: Tensor) -> Tensor:
+        """Gathers values of the subset at the samples: [B, M, C] -> [B, S, C], 0 for padding."""
+        rank, n = self._until - 1, self.n[:, None]
+        k = torch.where(n > SAMPLES, (rank * SAMPLES + n - 1) // n.clamp(min=1), rank).clamp(0, SAMPLES - 1)
+        is_sample = self._mask & (self._rank(k) == rank)
+        return _Take.apply(values, self._at, self.known, k, is_sample)
 
     def center(self, center: Tensor) -> None:
         """Subtracts ``center`` [B, 1, 3] from the positions, since squares of large coordinates lose precision."""
@@ -144,20 +152,6 @@ class Samples(Compact):
         """Number of samples [B, S] in a Gaussian window of ``radius`` metres around each sample, including itself."""
         near = gaussian(squared_distances(self.positions, self.positions), radius)
         return (near * self.known[:, None]).sum(2).clamp(min=1)
-
-
-def _along_curve(positions: Tensor, known: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor]:
-    """Order [B, M] of members along a Hilbert curve through their cube, in a cell by position; inverse of that order.
-    Rows outside ``known`` are last; scenes that are not ``chosen`` [B] keep their order."""
-    inside = (known & chosen[:, None])[:, :, None]
-    at = positions.double() - torch.where(inside, positions, torch.inf).amin(1, keepdim=True)
-    size = torch.where(inside, at, 0).amax((1, 2), keepdim=True).clamp(min=1e-6)
-    at = torch.where(inside, at / size * 2**36, 0).long().clamp(max=2**36 - 1)  # 16 bits of the cell, 20 inside it
-    codes = torch.where(known, curve_encode((at >> 20).flatten(0, 1), None, "hilbert").view_as(known), 1 << 62)
-    x, y, z = (at & (2**20 - 1)).unbind(2)
-    order, ranks = curve_sort(x << 40 | y << 20 | z)
-    then, back = curve_sort(codes.gather(1, order))
-    return order.gather(1, then), back.gather(1, ranks)
 
 
 class _Take(torch.autograd.Function):

@@ -93,7 +93,7 @@ def test_one_camera_is_refused_unless_it_is_named(restored, tmp_path):
     scene, _ = opened(restored, rig(tmp_path / "scene", 1))
     with pytest.raises(InputError, match="1 cameras left as inputs"):
         default_views(restored, scene)
-    with pytest.warns(FitWarning, match="1 input views, cameras 0; training used 4"):
+    with pytest.warns(FitWarning, match="1 input view, cameras 0; training used 4"):
         assert default_views(restored, scene, (0,)) == ((0,), (0,))
 
 
