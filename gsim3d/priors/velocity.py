@@ -76,7 +76,10 @@ def window_velocities(ctx: StepContext, radius: float) -> tuple[Tensor, Tensor]:
         movable = ctx.movable
         windows, now = Windows(movable, particles, radius, evenly=False), movable.samples
         last = mean = torch.zeros_like(windows.nodes)
-        of_scenes = lambda values: constant(tuple(values), last.device).to(last)[:, None, None]  # noqa: E731
+
+        def of_scenes(values: list[int]) -> Tensor:
+            return constant(tuple(values), last.device).to(last)[:, None, None]
+
         for number in range(max(map(len, older))):  # from the cloud before the newest on
             chosen = [(*some, *[q] * (number + 1))[number] for some, q in zip(older, ctx.newest)]
             then = Samples(Subset(PaddedClouds(particles, chosen, ctx.grid_size), particles))
