@@ -112,10 +112,13 @@ def test_export_shows_the_truth_beside_what_was_predicted(scene, tmp_path, capsy
         (["--scene", "SCENE", "--camera", "99", "--to", "b.mp4"], "--camera 99"),
         (["--scene", "SCENE", "--start", "99", "--to", "b.mp4"], "--start 99"),
         (["--scene", "SCENE", "--turns", "1", "--to", "b.mp4"], "do not go with --scene"),
+        (["--scene", "SCENE", "--size", "64", "--to", "b.mp4"], "do not go with --scene"),
         (["--camera", "1", "--to", "b.mp4"], "belong to --scene"),
+        (["--size", "64", "--turns", "1", "--to", "b.spz"], "b.spz: no file of this format has --size or --turns"),
+        (["--up-to", "y", "--to", "b.mp4"], "b.mp4: no file of this format has --up-to"),
     ],
 )
-def test_export_refuses_what_does_not_go_with_a_scene(arguments, says, scene, tmp_path, monkeypatch, capsys):
+def test_export_refuses_unused_options(arguments, says, scene, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     write_splats("a.ply", make())
     arguments = [str(scene) if one == "SCENE" else one for one in arguments]
