@@ -27,9 +27,8 @@ class Movable:
     """
 
     def __init__(self, history: Particles, grid_size: float, most: int | None = None):
-        self.newest = newest_clouds(history.clouds)
-        self._counts = [history.clouds.count(q) for q in self.newest]
-        table = history.clouds
+        table, self.newest = history.clouds, newest_clouds(history.clouds)
+        self._counts = [table.count(q) for q in self.newest]
         self.scenes = constant(tuple(table.scenes[q] for q in self.newest), history.means.device)
         with torch.no_grad(), torch.autocast(history.means.device.type, enabled=False):
             self.subset = Subset(PaddedClouds(history, self.newest, grid_size), history)

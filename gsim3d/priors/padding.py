@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
+from gsim3d.ops.curve import curve_encode, curve_sort
 from gsim3d.ops.validate_state import CELLS
 from gsim3d.state import DYNAMIC, Particles, constant
 
@@ -46,12 +47,13 @@ class Subset:
 
     Attributes:
         rows: int64 [B, M], indices of particles.
+        is_movable: whether the members are movable particles.
         known: bool [B, M], mask of the members.
         positions: [B, M, 3], metres from the origins of the scenes; 0 outside the mask.
     """
 
     def __init__(self, clouds: PaddedClouds, history: Particles, activity: int = DYNAMIC, opacity: float = 0.0):
-        self._clouds, self._history, self.rows = clouds, history, clouds.rows
+        self._clouds, self._history, self.rows, self.is_movable = clouds, history, clouds.rows, activity == DYNAMIC
         self.known = clouds.is_inside & (history.activity[self.rows] == activity)
         if opacity > 0:
             self.known = self.known & (history.opacities.detach()[self.rows] >= opacity)
@@ -107,37 +109,28 @@ def _take_flat(values: Tensor, *indices: Tensor) -> Tensor:
     return _Take.apply(values.reshape(*values.shape[:2], -1), *indices).reshape(len(values), -1, *values.shape[2:])
 
 
-class Samples:
-    """All members of a subset or, of larger subsets, ``SAMPLES`` of them at even intervals.
+class Samples(Compact):
+    """All members of a subset or, of larger subsets, ``SAMPLES`` of them at even intervals: movable particles along a
+    Hilbert curve, so that the order of rows does not matter, others in the order of rows.
 
     Attributes:
         n: int64 [B], number of members.
-        known: bool [B, S], False for padding.
         positions: [B, S, 3] in metres, 0 for padding.
         mean: mean position [B, 3].
     """
 
     def __init__(self, subset: Subset):
-        self._rows, self._mask, self._until = subset.rows, subset.known, subset.known.cumsum(1)
-        self.n = self._until[:, -1]
-        k = torch.arange(SAMPLES, device=self.n.device)
-        self.known = k < self.n[:, None]
-        self._at = torch.searchsorted(self._until, self._rank(k) + 1).clamp(max=self._until.shape[1] - 1)
-        positions = subset.positions.gather(1, self._at[:, :, None].expand(-1, -1, 3))
-        self.positions = torch.where(self.known[:, :, None], positions, 0)
+        super().__init__(subset.known, SAMPLES)
+        self.n = subset.known.sum(1)
+        if subset.known.shape[1] > SAMPLES:
+            codes = _curve_codes(subset, self.n > SAMPLES) if subset.is_movable else 0
+            order, ranks = curve_sort(torch.where(subset.known, codes, 1 << 62))  # equal codes keep their order
+            n = self.n.clamp(min=SAMPLES)[:, None]
+            self._at = order.gather(1, torch.arange(SAMPLES, device=n.device) * n // SAMPLES)
+            self._rank = ((ranks * SAMPLES + n - 1) // n).clamp(max=SAMPLES - 1)
+            self._mask = subset.known & (self._rank * n // SAMPLES == ranks)
+        self.positions = self.take(subset.positions)
         self.mean = self.mean_of(self.positions)
-
-    def _rank(self, k: Tensor) -> Tensor:
-        """Rank of sample ``k`` among the members."""
-        n = self.n[:, None]
-        return torch.where(n > SAMPLES, k * n // SAMPLES, k)
-
-    def take(self, values: Tensor) -> Tensor:
-        """Gathers values of the subset at the samples: [B, M, C] -> [B, S, C], 0 for padding."""
-        rank, n = self._until - 1, self.n[:, None]
-        k = torch.where(n > SAMPLES, (rank * SAMPLES + n - 1) // n.clamp(min=1), rank).clamp(0, SAMPLES - 1)
-        is_sample = self._mask & (self._rank(k) == rank)
-        return _Take.apply(values, self._at, self.known, k, is_sample)
 
     def center(self, center: Tensor) -> None:
         """Subtracts ``center`` [B, 1, 3] from the positions, since squares of large coordinates lose precision."""
@@ -152,6 +145,16 @@ class Samples:
         """Number of samples [B, S] in a Gaussian window of ``radius`` metres around each sample, including itself."""
         near = gaussian(squared_distances(self.positions, self.positions), radius)
         return (near * self.known[:, None]).sum(2).clamp(min=1)
+
+
+def _curve_codes(subset: Subset, chosen: Tensor) -> Tensor:
+    """Codes int64 [B, M] below 2^48 of the members along a Hilbert curve through their cube; equal ones in scenes that
+    are not ``chosen`` (bool [B])."""
+    inside = (subset.known & chosen[:, None])[:, :, None]
+    at = subset.positions.double() - torch.where(inside, subset.positions, torch.inf).amin(1, keepdim=True)
+    size = torch.where(inside, at, 0).amax((1, 2), keepdim=True).clamp(min=1e-6)
+    cells = torch.where(inside, at / size * CELLS, 0).long().clamp(max=CELLS - 1)
+    return curve_encode(cells.flatten(0, 1), None, "hilbert").view_as(subset.known)
 
 
 class _Take(torch.autograd.Function):

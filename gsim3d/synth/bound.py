@@ -235,7 +235,8 @@ def _summary(scenes: dict[tuple[str, int], np.ndarray], given: dict[str, float])
             if metric in given:
                 added[f"{kind}_given"] = 10 ** (-given[metric] / 10)
             for name, more in added.items():
-                table.setdefault(name, {})[metric] = np.array([_mean_psnr(error + more) for error in errors])
+                psnr = (-10 * np.log10(np.maximum((e + more).astype(float), 10 ** (-PSNR_CAP / 10))) for e in errors)
+                table.setdefault(name, {})[metric] = np.array([np.nanmean(x) for x in psnr])
 
     def means(of: np.ndarray) -> dict:
         return {
@@ -251,11 +252,6 @@ def _summary(scenes: dict[tuple[str, int], np.ndarray], given: dict[str, float])
     }
     by_object = {str(name): means(names == name) for name in dict.fromkeys(names)}
     return {**means(np.ones(len(names), bool)), "objects": by_object, "scenes": by_scene}
-
-
-def _mean_psnr(errors: np.ndarray) -> float:
-    """Mean PSNR of squared errors over samples, steps and cameras, without NaN."""
-    return float(np.nanmean(-10 * np.log10(np.maximum(errors.astype(np.float64), 10 ** (-PSNR_CAP / 10)))))
 
 
 def _mean_and_error(values: np.ndarray) -> list[float | None]:

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from gsim3d.priors import Motion, VelocityConfig, VelocityFromImagesConfig
+from gsim3d.priors import Motion, VelocityConfig, VelocityFromImagesConfig, padding
 from gsim3d.priors.velocity import slope_weights, window_velocities
 from gsim3d.state import DYNAMIC, FROZEN
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
@@ -94,6 +94,18 @@ def test_slope_is_less_noisy_than_the_last_displacement():
         errors.append(torch.stack([mean[0] - true, last[0] - true]).norm(dim=1))
     slope, difference = torch.stack(errors).square().mean(0).sqrt()
     assert slope < 0.5 * difference
+
+
+def test_order_of_rows_of_dense_clouds_does_not_matter(monkeypatch):
+    """More particles than samples, that move by ``v``, in another order of rows in each cloud."""
+    v, g = torch.tensor([0.004, -0.003, 0.001]), torch.Generator().manual_seed(0)
+    points = 1.0 + 0.2 * _even(2500, g)
+    clouds = [points[torch.randperm(2500, generator=g)] + step * v for step in range(4)]
+    history = dataclasses.replace(flown((2500,) * 4), means=torch.cat(clouds))
+    errors = lambda: [(found - v).norm(dim=1).max() for found in both_of(history)]  # noqa: E731
+    assert max(errors()) < 1e-5
+    monkeypatch.setattr(padding, "DYNAMIC", FROZEN)  # all are sampled in the order of rows
+    assert min(errors()) > 1e-3
 
 
 def test_ages_of_clouds_count():
