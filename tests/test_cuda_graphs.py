@@ -20,7 +20,8 @@ from gsim3d.simulator import Simulator
 from gsim3d.state import DYNAMIC, FROZEN, constant, keeping_constants
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import batch, float_fields, make_history
-from tests.test_simulator import CONFIG, look_at
+from tests.nn.multiview_encoder.scenes import look_at
+from tests.test_simulator import CONFIG
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -44,7 +45,7 @@ def make_state(seed=0, device="cpu", dtype=None, sizes=SIZES):
 
 def make_cameras(turn=0.0, n_scenes=2, device="cpu"):
     K = torch.tensor([[16.0, 0.0, 8.0], [0.0, 16.0, 8.0], [0.0, 0.0, 1.0]])
-    viewmats = torch.stack([look_at(turn + scene) for scene in range(n_scenes)]).float()
+    viewmats = torch.stack([look_at(turn + scene, 2.0) for scene in range(n_scenes)]).float()
     near, far = torch.full((n_scenes,), 1.0), torch.full((n_scenes,), 3.5)
     return Cameras(viewmats, K.repeat(n_scenes, 1, 1), near, far, torch.arange(n_scenes), 16, 16).to(device)
 

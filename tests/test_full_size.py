@@ -9,7 +9,7 @@ from gsim3d import presets
 from gsim3d.cameras import Cameras, Frames
 from gsim3d.simulator import Simulator
 from tests.asserts import assert_close_relative_to_max
-from tests.test_simulator import look_at
+from tests.nn.multiview_encoder.scenes import look_at
 
 pytestmark = pytest.mark.slow
 SIZE, VIEWS = 32, 4
@@ -22,7 +22,7 @@ def make_frames(n_steps):
     n_scenes = len(KEPT)
     n_clouds = n_scenes * n_steps
     n = n_clouds * VIEWS
-    viewmats = torch.stack([look_at(0.3 + 1.5 * view) for view in range(VIEWS)]).repeat(n_clouds, 1, 1).float()
+    viewmats = torch.stack([look_at(0.3 + 1.5 * view, 2.0) for view in range(VIEWS)]).repeat(n_clouds, 1, 1).float()
     K = torch.tensor([[1.2 * SIZE, 0.0, SIZE / 2], [0.0, 1.2 * SIZE, SIZE / 2], [0.0, 0.0, 1.0]]).repeat(n, 1, 1)
     clouds = torch.arange(n_clouds).repeat_interleave(VIEWS)
     scene = torch.arange(n_scenes).repeat_interleave(n_steps)

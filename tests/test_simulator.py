@@ -1,7 +1,6 @@
 """The whole way: images -> particles -> later particles -> images."""
 
 import dataclasses
-import math
 
 import pytest
 import torch
@@ -19,7 +18,7 @@ from gsim3d.state import DYNAMIC, FROZEN, last_steps
 from gsim3d.train.loop import deterministic
 from tests.asserts import assert_close_relative_to_max, assert_same_bits, with_threads
 from tests.dynamics.scenes import TINY
-from tests.nn.multiview_encoder.scenes import CONFIG as TINY_ENCODER
+from tests.nn.multiview_encoder.scenes import CONFIG as TINY_ENCODER, look_at
 from tests.priors.scenes import OCCLUSION
 
 SIZE = 16
@@ -31,22 +30,11 @@ CONFIG = ModelConfig(
 )
 
 
-def look_at(angle):
-    center = torch.tensor([2 * math.cos(angle), 2 * math.sin(angle), 1.0], dtype=torch.float64)
-    forward = -center / center.norm()
-    right = torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
-    right = right / right.norm()
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ center
-    return pose
-
-
 def make_frames(steps=(2,), n_views=2, seed=0, masked=True):
     """Scene i has steps[i] steps; each step the same cameras."""
     g = torch.Generator().manual_seed(seed)
     n_clouds = sum(steps)
-    viewmats = torch.stack([look_at(0.3 + 1.2 * v) for v in range(n_views)]).repeat(n_clouds, 1, 1).float()
+    viewmats = torch.stack([look_at(0.3 + 1.2 * v, 2.0) for v in range(n_views)]).repeat(n_clouds, 1, 1).float()
     K = torch.tensor([[16.0, 0.0, 8.0], [0.0, 16.0, 8.0], [0.0, 0.0, 1.0]])
     n = n_clouds * n_views
     clouds = torch.arange(n_clouds).repeat_interleave(n_views)

@@ -31,9 +31,9 @@ CONFIG = EncoderConfig(
 ROW_FIELDS = ("means", "opacities", "dynamic_latents", "static_latents")
 
 
-def look_at(angle: float) -> torch.Tensor:
-    """World-to-camera of a camera 3 m from the z axis that looks at the origin."""
-    center = torch.tensor([3 * math.cos(angle), 3 * math.sin(angle), 1.5], dtype=torch.float64)
+def look_at(angle: float, far: float = 3.0) -> torch.Tensor:
+    """World-to-camera of a camera ``far`` metres from the z axis, half as high, that looks at the origin."""
+    center = torch.tensor([far * math.cos(angle), far * math.sin(angle), far / 2], dtype=torch.float64)
     forward = -center / center.norm()
     right = torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
     right = right / right.norm()
