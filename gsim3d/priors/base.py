@@ -14,7 +14,7 @@ from gsim3d.errors import InputError, check_ranges
 from gsim3d.nn.layers import RowLinear
 from gsim3d.nn.point_transformer import STEM_KERNEL, SparseConv
 from gsim3d.priors.movable import Movable, Windows
-from gsim3d.state import ATTRIBUTES, Particles, newest_clouds, take_runs, with_attribute
+from gsim3d.state import ATTRIBUTES, Particles, cached_zero, newest_clouds, take_runs, with_attribute
 
 MAX_GAIN = 2.0  # gains are bounded to [-MAX_GAIN, MAX_GAIN]
 
@@ -290,8 +290,8 @@ def bounded_gains(gains: Tensor) -> Tensor:
 
 def put_runs(x: Tensor, runs: Sequence[tuple[int, int]], n_rows: int, fill: float = 0.0) -> Tensor:
     """Places the rows of ``x`` in the ranges ``runs`` of [n_rows, ...], with ``fill`` elsewhere."""
-    pieces, end = [], 0
+    pieces, end, blank = [], 0, x.new_full((), fill) if fill else cached_zero(x.dtype, x.device)
     for part, (begin, until) in zip(x.split([until - begin for begin, until in runs]), runs, strict=True):
-        pieces += [x.new_full((begin - end, *x.shape[1:]), fill), part]
+        pieces += [blank.expand(begin - end, *x.shape[1:]), part]
         end = until
-    return torch.cat([*pieces, x.new_full((n_rows - end, *x.shape[1:]), fill)])
+    return torch.cat([*pieces, blank.expand(n_rows - end, *x.shape[1:])])
