@@ -259,7 +259,7 @@ class Dynamics(nn.Module):
     ) -> StepContext:
         """The context of priors for a step from ``particles``, of which ``state`` returns the newest."""
         config, most = self.config, self._most_movable
-        options = {"most_movable": most, "changes": changes, "share": self.layout.share, "state": state}
+        options = {"most_movable": most, "changes": changes, "rows": self.layout.rows, "state": state}
         return StepContext(particles, self.priors, config.grid_size, 2**config.history_bits, **options)
 
     def _with_initial_latents(self, history: Particles, changes: Mapping[str, str]) -> Particles:

@@ -100,7 +100,8 @@ class StateLayout:
                 gains[name] = part
             else:
                 outputs.setdefault(name, []).append(part)
-        return {name: torch.stack(steps) for name, steps in outputs.items()}, gains
+        outputs = {name: s[0][None] if len(s) == 1 else torch.stack(s) for name, s in outputs.items()}
+        return outputs, gains
 
     def input_columns(self, particles: Particles) -> list[Tensor]:
         """Network input of all particles, as columns [N, n] of ``in_channels`` in all."""
@@ -133,42 +134,40 @@ class StateLayout:
         of :meth:`split` and ``displacements`` [S, N, 3] in metres. Particles in ``frozen_appearance`` keep latents and
         colours. ``awake``: bool [N], particles that may change, None: all; ``changes``: of :meth:`changes`."""
         changes = changes or self.changes()
-        share = self.share(particles, "means", changes["means"], awake)
-        means = particles.means[None]
-        later = {"means": hold(share, means, means + share * displacements)}
+        rows, means = self.rows(particles, "means", changes["means"], awake), particles.means[None]
+        later = {"means": hold(rows, means, means + displacements)}
         for name in (name for name in outputs if name != "means"):
-            share = self.share(particles, name, changes[name], awake)
-            later[name] = self.later_values(name, getattr(particles, name), outputs[name], share)
+            newest, rows = getattr(particles, name), self.rows(particles, name, changes[name], awake)
+            changed = self.later_values(name, newest, outputs[name], rows)
+            later[name] = hold(rows.view(-1, *[1] * (newest.dim() - 1)), newest[None], changed)
         # A view of the only step: its gradient is not copied.
         later = {name: x.unbind() if len(x) > 1 else (x.squeeze(0),) for name, x in later.items()}
         steps = (dict(zip(later, values)) for values in zip(*later.values(), strict=True))
         return [dataclasses.replace(particles, **step) for step in steps]
 
     @staticmethod
-    def share(particles: Particles, name: str, which: str, awake: Tensor | None) -> Tensor:
-        """Mask [N, 1] in the dtype of positions: 1 for particles whose attribute ``name`` changes for ``which``."""
-        activity = particles.activity
-        if which in ("all", "none"):
+    def rows(particles: Particles, name: str, which: str, awake: Tensor | None) -> Tensor:
+        """Mask bool [N, 1] of particles whose attribute ``name`` changes for ``which``."""
+        activity, mask = particles.activity, awake
+        if which in ("dynamic", "frozen"):
+            chosen = activity == FROZEN if which == "frozen" else activity != FROZEN
+            mask = chosen if awake is None else chosen & awake
+        elif which == "none" or awake is None:
             mask = torch.full_like(activity, which == "all", dtype=torch.bool)
-        else:
-            mask = activity == FROZEN if which == "frozen" else activity != FROZEN
-        mask = mask if awake is None else mask & awake
         if name in APPEARANCE and particles.frozen_appearance is not None:
             mask = mask.masked_fill(particles.frozen_appearance, False)
-        return mask[:, None].to(particles.means)
+        return mask[:, None]
 
     def later_values(self, name: str, newest: Tensor, predicted: Tensor, share: Tensor) -> Tensor:
         """Values [S, N, ...] of an attribute after each step of a call, from the ``newest`` ones [N, ...] and network
-        outputs [S, N, channels]; ``share``: factor [N, 1] of the predicted change, 0 keeps the bits of the value."""
+        outputs [S, N, channels]; ``share``: factor [N, 1] of the predicted change, or mask of rows that change."""
         if name == "quats":
             return self._later_quats(newest, predicted, share)
         share = share.reshape(*share.shape[:-1], *(1,) * (newest.dim() - 1))
         changed = newest[None] + share * self._differences(name, newest, predicted)
         if name == "scales":
-            changed = changed.clamp(self.config.scale_min, self.config.scale_max)
-        if name == "opacities":
-            changed = changed.clamp(0, self.config.max_opacity)
-        return hold(share, newest[None], changed)
+            return changed.clamp(self.config.scale_min, self.config.scale_max)
+        return changed.clamp(0, self.config.max_opacity) if name == "opacities" else changed
 
     def _differences(self, name: str, newest: Tensor, predicted: Tensor) -> Tensor:
         """Change [S, N, ...] of an attribute from its newest values, for each step."""
@@ -193,7 +192,7 @@ class StateLayout:
         return predicted
 
     def _target(self, name: str, predicted: Tensor) -> Tensor:
-        config = self.config
+        config, predicted = self.config, predicted.contiguous()  # a CPU rounds sigmoids of strided rows otherwise
         if name == "opacities":
             return predicted.sigmoid()
         if name == "scales":
@@ -204,12 +203,12 @@ class StateLayout:
         """:meth:`later_values` of quaternions, which are normalised where they change."""
         if self.config.predicts == "absolute":
             target = predicted.roll(1, 2)
-            return hold(share, newest, unit_quats(newest + share * (target - newest)))
+            return unit_quats(newest + share * (target - newest))
         later, before = [], newest
         for vectors in (share * predicted).unbind(0):
             later.append(rotate_left(before, vectors))
             before = later[-1] if self.config.predicts == "from_previous" else newest
-        return hold(share, newest[None], torch.stack(later))
+        return torch.stack(later)
 
 
 def _flat(name: str, value: Tensor) -> Tensor:

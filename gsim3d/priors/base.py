@@ -111,14 +111,14 @@ class StepContext:
         *,
         most_movable: int | None = None,
         changes: dict[str, str] | None = None,
-        share: Callable[..., Tensor] | None = None,
+        rows: Callable[..., Tensor] | None = None,
         state: Callable[[], Particles] | None = None,
     ):
         self.history, self.priors, self.grid_size, self.max_steps = history, priors, grid_size, max_steps
         self.newest = newest_clouds(history.clouds)
         self.runs = history.clouds.row_runs(self.newest)
         self.changes, self.awake, self.n_views = changes, None, None
-        self._most_movable, self._share, self._shared = most_movable, share, {}
+        self._most_movable, self._rows, self._shared = most_movable, rows, {}
         # Without self in it: a cycle would keep the autograd graph until the next garbage collection.
         self._make_state = state if state is not None else lambda newest=self.newest: history.select_clouds(newest)
 
@@ -163,10 +163,10 @@ class StepContext:
         """Scatters values of the newest clouds to all particles: [N, ...] -> [M, ...], ``fill`` elsewhere."""
         return put_runs(values, self.runs, self.history.n_rows, fill)
 
-    def share(self, attribute: str, changed: str | None = None) -> Tensor:
-        """Mask [N, 1] in the dtype of positions: 1 for particles whose ``attribute`` this step changes; ``changed``
-        replaces its entry of ``changes``."""
-        return self._share(self.state, attribute, changed or self.changes[attribute], self.awake)
+    def rows(self, attribute: str, changed: str | None = None) -> Tensor:
+        """Mask bool [N, 1] of particles whose ``attribute`` this step changes; ``changed`` replaces its entry of
+        ``changes``."""
+        return self._rows(self.state, attribute, changed or self.changes[attribute], self.awake)
 
 
 class Prior(nn.Module):
@@ -278,9 +278,9 @@ def bounded(x: Tensor, limit: float | None) -> Tensor:
     return x if limit is None else limit * torch.tanh(x)
 
 
-def hold(share: Tensor, newest: Tensor, later: Tensor) -> Tensor:
-    """``newest`` where ``share`` is 0, with the same bits and no gradient into ``later``; else ``later``."""
-    return torch.where(share > 0, later, newest)
+def hold(rows: Tensor, newest: Tensor, later: Tensor) -> Tensor:
+    """``later`` in ``rows``; elsewhere ``newest``, with the same bits and no gradient into ``later``."""
+    return torch.where(rows, later, newest)
 
 
 def bounded_gains(gains: Tensor) -> Tensor:

@@ -157,7 +157,7 @@ class OcclusionLight(_Light):
         most = self.config.max_gain
         if predicted is not None:
             log_gain = bounded((predicted + log_gain) / most, most)
-        return hold(ctx.share("irradiance_gain"), ctx.state.irradiance_gain, log_gain.exp())
+        return hold(ctx.rows("irradiance_gain"), ctx.state.irradiance_gain, log_gain.exp())
 
 
 class LambertianLight(_Light):
@@ -186,9 +186,9 @@ class LambertianLight(_Light):
     def _gain(self, ctx: StepContext, log_gain: Tensor, predicted: Tensor | None) -> Tensor:
         most = self.config.max_gain
         if predicted is not None:
-            log_gain = log_gain + ctx.share("irradiance_gain") * bounded(predicted / most, most)
+            log_gain = log_gain + ctx.rows("irradiance_gain") * bounded(predicted / most, most)
         # The light changes all particles, also those whose other appearance is frozen.
-        return hold(ctx.share("irradiance_gain", "all"), ctx.state.irradiance_gain, log_gain.exp())
+        return hold(ctx.rows("irradiance_gain", "all"), ctx.state.irradiance_gain, log_gain.exp())
 
 
 def optical_depth(movable: Movable, lights: Tensor, grid_size: float, beam: float) -> Tensor:
