@@ -26,6 +26,7 @@ from gsim3d.priors.base import put_runs
 from gsim3d.priors.position_waves import relative_positions
 from gsim3d.state import (
     ASLEEP,
+    DYNAMIC,
     FROZEN,
     CloudTable,
     Newest,
@@ -34,7 +35,6 @@ from gsim3d.state import (
     constant,
     newest_clouds,
     single_steps,
-    take_runs,
     with_attribute,
 )
 
@@ -194,7 +194,7 @@ class Dynamics(nn.Module):
             curves = None if background is None else background.curves
             rounded = background is None and self._rounds(history)
             pyramid = self.geometry(history, generator=generator, curves=curves, rounded=rounded)
-        ctx = self.context(history, changes, partial(self._state, history, newest))
+        ctx = self.context(history, changes, partial(self._state, newest, changes))
         outputs, gains = self._predict(ctx, pyramid, generator, background)
         displacements = self.layout.displacements(ctx.state, outputs)
         if any(prior.acts for prior in self.priors) and not ctx.is_empty:
@@ -226,9 +226,8 @@ class Dynamics(nn.Module):
         all_seen = n_seen == history.n_rows
         if not all_seen:  # rows of the pyramid <-> rows of the history; unseen rows become 0
             columns = [ops.pool_mean(column, pyramid.rows, pyramid.cu_rows, check=False) for column in columns]
-        if self.config.graph is None:
-            columns = [column.to(product_dtype(column)) for column in columns]
         x = columns[0] if len(columns) == 1 else torch.cat(columns, 1)
+        x = x.to(product_dtype(x)) if self.config.graph is None else x
         contexts = () if background is None else background.readers(pyramid, history)
         x = self.net(x, pyramid, generator=self._draws(generator, x.device), contexts=contexts)
         if not all_seen:
@@ -273,13 +272,12 @@ class Dynamics(nn.Module):
             latents = torch.where((history.activity == FROZEN)[:, None], latents, history.dynamic_latents)
         return dataclasses.replace(history, dynamic_latents=latents)
 
-    def _state(self, history: Particles, newest: Newest) -> Particles:
+    def _state(self, newest: Newest, changes: Mapping[str, str]) -> Particles:
         """The newest particles of :meth:`_with_initial_latents`; those that sleep keep their latents."""
         particles = newest()
         if not self.config.is_relightable:
             return particles
-        clouds = history.clouds
-        latents = take_runs(history.dynamic_latents, clouds.row_runs(newest_clouds(clouds)))
+        latents = self._with_initial_latents(particles, changes).dynamic_latents
         latents = torch.where((particles.activity == ASLEEP)[:, None], particles.dynamic_latents, latents)
         return dataclasses.replace(particles, dynamic_latents=latents)
 
@@ -292,12 +290,11 @@ class Dynamics(nn.Module):
 
     def _seen(self, history: Particles) -> Tensor:
         """bool [N], particles in the network's input."""
-        seen = history.activity != ASLEEP
-        if self.config.is_relightable:
-            runs = history.clouds.row_runs(newest_clouds(history.clouds))
-            newest = torch.ones_like(seen[: sum(end - begin for begin, end in runs)])
-            seen = seen & ((history.activity != FROZEN) | put_runs(newest, runs, history.n_rows))
-        return seen
+        if not self.config.is_relightable:
+            return history.activity != ASLEEP
+        runs = history.clouds.row_runs(newest_clouds(history.clouds))
+        frozen = constant((FROZEN,), history.activity.device).expand(sum(end - begin for begin, end in runs))
+        return history.activity <= put_runs(frozen, runs, history.n_rows, DYNAMIC)  # frozen ones in the newest clouds
 
     def _rounds(self, history: Particles) -> bool:
         """Whether sizes are rounded up, so that matrix products have few different sizes: cuBLAS selects an algorithm
@@ -345,6 +342,7 @@ def _seen_first(seen: Tensor, cu_rows: Tensor, n_rows: int) -> tuple[Tensor, Ten
     """Selects ``n_rows`` particles, seen ones first, without a device sync. Returns their indices, the offsets of the
     clouds among them, the mask of seen ones, and the total number of seen particles."""
     until = F.pad(seen.cumsum(0), (1, 0))
-    rows = torch.sort((~seen).to(torch.uint8), stable=True).indices[:n_rows]
+    rows = torch.sort(seen.view(torch.uint8), descending=True, stable=True).indices[:n_rows]
     starts = until[cu_rows].clamp(max=n_rows)
-    return rows, torch.cat([starts[:-1], starts.new_full((1,), n_rows)]), seen[rows], until[-1]
+    starts[-1:].fill_(n_rows)
+    return rows, starts, seen[rows], until[-1]
