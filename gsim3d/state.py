@@ -162,6 +162,7 @@ class _Pieces(torch.autograd.Function):
 
 
 @functools.cache
+@torch.inference_mode(False)
 def cached_zero(dtype: torch.dtype, device: torch.device) -> Tensor:
     """Returns a scalar 0 that no launch fills."""
     return torch.zeros((), dtype=dtype, device=device)

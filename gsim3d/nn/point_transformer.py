@@ -24,6 +24,7 @@ from gsim3d.nn.fused_block import run_block
 from gsim3d.nn.layers import RowLayerNorm, RowLinear, make_norm, product_dtype, rounded_weights, row_linear, widened
 from gsim3d.ops.curve import PatchTable, Pyramid, PyramidSpec, Stage
 from gsim3d.ops.streams import Streams
+from gsim3d.state import cached_zero, constant
 
 STEM_KERNEL, BLOCK_KERNEL = 5, 3  # edges of the convolutions, in cells
 MAX_HISTORY_BITS = 32  # that the geometry counts
@@ -310,9 +311,9 @@ class Stem(nn.Module):
         x, others = x.split([x.shape[1] - n, n], 1) if n else (x, None)
         x = self.conv(x.contiguous(), stage, context)
         if n:
-            padding = (0, -n % COLUMN_MULTIPLE)
-            weight = torch.cat([linear.weight for linear in self._in_projs], 1)
-            x = x + row_linear(F.pad(others, padding), F.pad(weight, padding), None)
+            sides = [others], [linear.weight for linear in self._in_projs]
+            zeros = (cached_zero(of[0].dtype, x.device).expand(len(of[0]), -n % COLUMN_MULTIPLE) for of in sides)
+            x = x + row_linear(*(torch.cat([*of, zero], 1) for of, zero in zip(sides, zeros, strict=True)), None)
         return self.norm.activated(x, stage.n_data)
 
 
@@ -349,7 +350,8 @@ class Merge(nn.Module):
         if stage.time_index is None:
             return x + self.time_embedding[self.newest].to(x.dtype)
         # A product with a one-hot matrix: its gradient is a sum in row order, where indexing would use atomics on CUDA.
-        return x + F.one_hot(stage.time_index, self.time_embedding.shape[0]).to(x) @ self.time_embedding
+        marks = constant(tuple(range(self.time_embedding.shape[0])), x.device)
+        return x + (stage.time_index[:, None] == marks).to(x) @ self.time_embedding
 
 
 class EncoderStage(nn.Module):

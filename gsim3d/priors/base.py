@@ -79,8 +79,7 @@ class Motion:
     @classmethod
     def of_network(cls, network: Tensor) -> Motion:
         """A motion whose other terms are zero."""
-        zero = torch.zeros_like(network)
-        return cls(zero, zero, zero, network)
+        return cls(*[cached_zero(network.dtype, network.device).expand_as(network)] * 3, network)
 
     def total(self) -> Tensor:
         """The sum of the four terms."""
