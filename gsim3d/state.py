@@ -32,6 +32,7 @@ def _recent_constant(values: tuple[int, ...], device: torch.device) -> Tensor:
 
 
 _stores: list[dict[tuple, Tensor]] = []
+_cached_zeros = functools.cache(torch.inference_mode(False)(torch.zeros))
 
 
 def constant(values: tuple[int, ...], device: torch.device) -> Tensor:
@@ -161,11 +162,9 @@ class _Pieces(torch.autograd.Function):
         return torch.cat(pieces) if len(pieces) > 1 else pieces[0], None
 
 
-@functools.cache
-@torch.inference_mode(False)
 def cached_zero(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Returns a scalar 0 that no launch fills."""
-    return torch.zeros((), dtype=dtype, device=device)
+    """Returns a scalar 0 that no launch fills, but where it is compiled."""
+    return (torch.zeros if torch.compiler.is_compiling() else _cached_zeros)((), dtype=dtype, device=device)
 
 
 @dataclass(frozen=True)
