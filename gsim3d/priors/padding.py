@@ -14,6 +14,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from gsim3d.ops.curve import curve_encode, curve_sort
+from gsim3d.ops.segment import segment_sum
 from gsim3d.ops.validate_state import CELLS
 from gsim3d.state import DYNAMIC, Particles, constant
 
@@ -138,8 +139,10 @@ class Samples(Compact):
         self.mean = self.mean - center[:, 0]
 
     def mean_of(self, values: Tensor) -> Tensor:
-        """Mean [B, C] of ``values`` [B, S, C]."""
-        return torch.where(self.known[:, :, None], values, 0).sum(1) / self.n.clamp(1, SAMPLES)[:, None]
+        """Mean [B, C] of ``values`` [B, S, C]; the bits of a scene do not depend on B."""
+        ends = constant(tuple(SAMPLES * q for q in range(len(values) + 1)), values.device)
+        total = segment_sum(torch.where(self.known[:, :, None], values, 0).flatten(0, 1), ends, check=False)
+        return total / self.n.clamp(1, SAMPLES)[:, None]
 
     def density(self, radius: float) -> Tensor:
         """Number of samples [B, S] in a Gaussian window of ``radius`` metres around each sample, including itself."""
