@@ -46,7 +46,6 @@ def test_graph_with_parallel_streams_has_the_same_bits(devices):
     assert_same_bits(captured(), chains(x, weight))
 
 
-@pytest.mark.unsanitized("captures a graph, which needs torch's memory pool")
 def test_failure_in_a_stream_is_raised(devices):
     def wrong(x):
         with Streams(x) as streams:
