@@ -225,6 +225,15 @@ def first_run(store, tmp_path):
     return trainer, tmp_path / "state", save_state(trainer, tmp_path / "state", NAME, progress)
 
 
+def test_average_follows_the_weights_of_a_short_run(store, tmp_path):
+    """The next run begins at the average: of weights that change steadily for 500 steps it keeps most of the change."""
+    decay = RunTrainer(CONFIG, store, tmp_path / "run", "cpu").config.optimizer.ema_decay
+    average = 0.0
+    for step in range(1, 501):
+        average += (1 - decay) * (step - average)
+    assert average > 0.75 * 500
+
+
 def test_next_run_goes_on_from_state(first_run, store, tmp_path):
     trainer, state, done = first_run
     progress = load_progress(state, NAME)
@@ -372,10 +381,11 @@ def test_the_next_run_has_the_capacity_that_graphs_needed(store, tmp_path):
         trainer.captured = trainer._capture()
     known = {"rows": 10_000, "moving": 500, "geometry": [[[0], [0, 1], [7, 8]]], "margin": 1}
     first.captured.reserve(known)
-    end = time.monotonic() + 2
+    first.goes_on = iter([True, False]).__next__  # one step, however long it takes
+    end = time.monotonic() + 60
     train(first, NoWorkers(), Progress(), {}, end=end, out=tmp_path / "state", name=NAME, say=lambda _: None)
     progress = load_progress(tmp_path / "state", NAME)
-    assert progress.step and progress.needed == first.captured.needed
+    assert progress.step == 1 and progress.needed == first.captured.needed
     assert known["geometry"][0] in progress.needed["geometry"]
     load_into(second, tmp_path / "state", NAME)
     assert second.captured.needed == progress.needed and second.captured.most_particles == 10_000

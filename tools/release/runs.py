@@ -21,6 +21,7 @@ from tools.release.state import CURVE, Progress, save_state, save_weights
 from tools.release.trajectories import DataWorkers, TrajectoryStore
 
 WARM_UP = 50  # steps after each start: first moments begin at zero
+AVERAGED = 0.99  # decay of the averaged weights, at which the next run begins: a slower average would lag behind
 COOL_DOWN = 0.5  # share of a last run in which the learning rate falls to LAST_RATE of its peak
 LAST_RATE = 0.01
 SAVE_EVERY = 120.0  # seconds
@@ -38,7 +39,8 @@ class RunTrainer(Trainer):
         self, config: TrainConfig, store: TrajectoryStore, out: Path, device: str, processes: Processes | None = None
     ):
         self.store = store
-        config = of_processes(config, processes.count if processes else 1)
+        averaged = dataclasses.replace(config.optimizer, ema_decay=AVERAGED)
+        config = dataclasses.replace(of_processes(config, processes.count if processes else 1), optimizer=averaged)
         super().__init__(config, store.trajectories[:1], out, device=device, processes=processes)
         self.first_step, self.begin, self.now, self.end, self.is_last = 0, 0.0, 0.0, math.inf, False
         self.gone: str | None = None
