@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parent.parent.parent
 sys.path.insert(0, str(ROOT))
 from gsim3d.errors import CaptureError, InputError, NumericalError, RunStopped  # noqa: E402
 
-SCORING_SHARE, SCORING_MOST = 0.2, 150.0  # of a run, seconds: for validation at its end
+SCORING_SHARE, SCORING_MOST = 0.2, 100.0  # of a run, seconds: for validation at its end
 SPARE_CORES = 3  # that each training process keeps
 VALIDATION_WORKERS = 2  # that make validation trajectories
 
