@@ -46,7 +46,7 @@ from gsim3d.ops.curve import Pyramid
 from gsim3d.ops.raster import Rendering
 from gsim3d.presets import ModelConfig
 from gsim3d.pretrained import loading
-from gsim3d.state import DYNAMIC, FROZEN, Gaussians, Particles, append_step, concatenate, last_steps
+from gsim3d.state import DYNAMIC, FROZEN, Gaussians, Newest, Particles, append_step, concatenate, last_steps
 
 
 class Simulator(nn.Module):
@@ -482,10 +482,10 @@ class Simulator(nn.Module):
         history = self.dynamics.actions.added(state, acting) if acting else state
         pyramid = None if geometry is None else geometry(history)
         options = {"pyramid": pyramid, "background": background, "changes": changes}
-        newest = last_steps(state, 1)
+        newest = Newest(state)
         step = self.dynamics(history, generator=generator, newest=None if acting else newest, **options)
         step = self.dynamics.actions.removed(step) if acting else step
-        previous = [newest] * self.config.dynamics.steps_per_call
+        previous = [newest()] * self.config.dynamics.steps_per_call
         previous = concatenate(previous) if len(previous) > 1 else previous[0]
         changed = [name for name, which in changes.items() if which != "none"]
         return guard(step, previous=previous, changed=changed)

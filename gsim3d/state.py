@@ -13,7 +13,6 @@ import functools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -379,7 +378,6 @@ class Particles(TensorRecord):
     known: CloudTable | None = None
 
     ROW_FIELDS = tuple(ATTRIBUTES)
-    _newest: ClassVar[tuple[Particles, ...]] = ()  # of append_step; no field: copies with other values have none
 
     @property
     def n_rows(self) -> int:
@@ -466,22 +464,27 @@ def _last(scenes: Sequence[int], steps: Sequence[int], n_steps: int) -> list[int
 
 
 def append_step(history: Particles, step: Particles, max_steps: int) -> Particles:
-    """Appends the clouds of ``step`` to ``history`` and keeps the last ``max_steps`` clouds of each scene; where they
-    are the newest of all scenes, :func:`last_steps` need not copy them out of the result."""
-    both, table = concatenate([history, step], max_steps), step.clouds
-    newest = [(both.clouds.scenes[q], both.clouds.steps[q]) for q in newest_clouds(both.clouds)]
-    is_newest = newest == list(zip(table.scenes, table.steps)) and both.row_fields().keys() == step.row_fields().keys()
-    if is_newest and not torch.compiler.is_compiling():
-        object.__setattr__(both, "_newest", (both.with_clouds(table, **step.row_fields()),))
-    return both
+    """Appends the clouds of ``step`` to ``history`` and keeps the last ``max_steps`` clouds of each scene."""
+    return concatenate([history, step], max_steps)
 
 
 def last_steps(particles: Particles, n_steps: int) -> Particles:
     """Returns the particles of the last ``n_steps`` clouds of each scene."""
-    if n_steps == 1 and particles._newest:
-        return particles._newest[0]
     kept = _last(particles.clouds.scenes, particles.clouds.steps, n_steps)
     return particles if len(kept) == particles.n_clouds else particles.select_clouds(kept)
+
+
+class Newest:
+    """``last_steps(particles, 1)``, selected in the first call."""
+
+    def __init__(self, particles: Particles):
+        self._particles = particles
+        self._newest: Particles | None = None
+
+    def __call__(self) -> Particles:
+        if self._newest is None:
+            self._newest = last_steps(self._particles, 1)
+        return self._newest
 
 
 def with_velocity(particles: Particles, rows: Tensor, velocity: Tensor) -> Particles:

@@ -29,10 +29,10 @@ from gsim3d.state import (
     DYNAMIC,
     FROZEN,
     CloudTable,
+    Newest,
     Particles,
     concatenate,
     constant,
-    last_steps,
     newest_clouds,
     single_steps,
     with_attribute,
@@ -163,7 +163,7 @@ class Dynamics(nn.Module):
         pyramid: Pyramid | None = None,
         background: FrozenContext | None = None,
         changes: Mapping[str, str] | None = None,
-        newest: Particles | None = None,
+        newest: Newest | None = None,
     ) -> Particles:
         """Predicts the next ``config.steps_per_call`` steps of every scene.
 
@@ -175,7 +175,7 @@ class Dynamics(nn.Module):
             background: context of the static particles, from :meth:`remember`; ``history`` then holds the moving
                 particles of a :class:`Partition`. None: computed here if ``config.background="asymmetric"``.
             changes: attributes that a step changes, from ``layout.changes``; None: all predicted attributes.
-            newest: newest particles of ``history``; None: selected here.
+            newest: of ``history``; None: made here.
         Returns:
             One cloud a scene and step, with the particles of the scene's newest step.
         Gradients:
@@ -188,7 +188,7 @@ class Dynamics(nn.Module):
         if background is None and self.config.is_asymmetric:
             return self._forward_in_parts(history, generator, changes)
         begun = self.begin(history)
-        newest = newest if newest is not None and begun is history else last_steps(begun, 1)
+        newest = newest if newest is not None and begun is history else Newest(begun)
         history = self._with_initial_latents(begun, changes)
         if pyramid is None:
             curves = None if background is None else background.curves
@@ -272,8 +272,9 @@ class Dynamics(nn.Module):
             latents = torch.where((history.activity == FROZEN)[:, None], latents, history.dynamic_latents)
         return dataclasses.replace(history, dynamic_latents=latents)
 
-    def _state(self, particles: Particles, changes: Mapping[str, str]) -> Particles:
+    def _state(self, newest: Newest, changes: Mapping[str, str]) -> Particles:
         """The newest particles of :meth:`_with_initial_latents`; those that sleep keep their latents."""
+        particles = newest()
         if not self.config.is_relightable:
             return particles
         latents = self._with_initial_latents(particles, changes).dynamic_latents

@@ -259,7 +259,7 @@ def _with_fields(particles: Particles, fields: dict[str, Tensor]) -> Particles:
     if torch.compiler.is_compiling():
         return dataclasses.replace(particles, **fields)
     made = object.__new__(Particles)
-    vars(made).update(vars(particles), **fields, _newest=())
+    vars(made).update(vars(particles), **fields)
     return made
 
 
