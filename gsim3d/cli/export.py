@@ -8,14 +8,12 @@ FILE's suffix chooses the format (docs/reference/splat_formats.md has their boun
 
 examples:
   gsim3d export runs/ball --to ball.usdc                  all predicted frames of gsim3d simulate
-  gsim3d export runs/ball --frame -1 --to ball.spz        the last one
   gsim3d export runs/ball --to ball.mp4 --size 720        a video from an orbiting camera, with the time
   gsim3d export garden.ply --to orbit.mp4                 once around a single frame, in six seconds
   gsim3d export runs/ball --scene data/elastic/ball/0000 --to ball.html    truth beside prediction; also .mp4
 """
 
 import argparse
-from pathlib import Path
 
 from gsim3d.cli.arguments import number, whole
 
@@ -45,8 +43,8 @@ def run(args: argparse.Namespace) -> int:
 
     if args.scene is None and (args.start or args.camera):
         raise InputError("--start and --camera belong to --scene")
-    of_format = {".mp4": ("up_to",), ".html": ("up_to", "size", "turns")}
-    unused = of_format.get(Path(args.to).suffix.lower(), ("size", "turns"))
+    of_format = {"mp4": ("up_to",), "html": ("up_to", "size", "turns")}
+    unused = of_format.get(args.to.lower().rpartition(".")[2], ("size", "turns"))
     if given := [f"--{name.replace('_', '-')}" for name in unused if getattr(args, name) is not None]:
         raise InputError(f"{args.to}: no file of this format has {' or '.join(given)}")
     if args.scene is None:

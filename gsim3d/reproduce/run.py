@@ -13,7 +13,7 @@ import torch
 
 from gsim3d import pretrained
 from gsim3d.data import find_scenes
-from gsim3d.errors import CaptureError, FitWarning, InputError, NumericalError, did_you_mean
+from gsim3d.errors import CaptureError, FitWarning, InputError, NumericalError
 from gsim3d.evaluate.ablations import Row as Ablation, Study, base_run, load_ablations
 from gsim3d.evaluate.pictures import pyplot
 from gsim3d.evaluate.protocol import default_views
@@ -110,8 +110,7 @@ def _worlds(job: Job) -> list[str]:
         known = [name for name in known if not name.startswith(".")]
     for world in job.worlds or ():
         if world not in known:
-            hint = did_you_mean(world, known)
-            raise InputError(f"--worlds: {world!r} does not exist; choose from {', '.join(known) or 'none'}{hint}")
+            raise InputError(f"--worlds: {world!r} does not exist; choose from {', '.join(known) or 'none'}")
     if not (job.worlds or known):
         raise InputError(f"--data: {job.data} has no folder of a world, such as {job.data}/{WORLDS[0]}")
     return list(job.worlds or known)
