@@ -162,7 +162,7 @@ class _Pieces(torch.autograd.Function):
 
 
 def cached_zero(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Returns a scalar 0 that no launch fills, but where it is compiled."""
+    """Returns a cached scalar 0, or a new one in compiled code."""
     return (torch.zeros if torch.compiler.is_compiling() else _cached_zeros)((), dtype=dtype, device=device)
 
 
