@@ -31,7 +31,7 @@ class Recipe:
     preset: str = "published"  #: of the world
     options: dict[str, Any] = field(default_factory=dict)  #: of the world, where they differ from the preset
     capacity: int = 240  #: trajectories in device memory at a time; the newest replace the oldest
-    n_first: int = 24  #: trajectories that must be there before training begins
+    n_first: int = 12  #: trajectories that must be there before training begins
     n_validation: int = 24  #: trajectories that are predicted and scored
 
     def stream(self) -> World:
