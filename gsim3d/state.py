@@ -233,7 +233,7 @@ def attributes_of(*kinds: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Actions(TensorRecord):
-    """Known motions of the points of actors, such as a pusher's center or the joints of a hand, in B scenes.
+    """Known motions of the points of actors, such as those on a pusher or the joints of a hand, in B scenes.
 
     A model with action particles (``model.dynamics.actions``) reads them if the plan has ``dynamics.actions`` on: to
     predict step t + 1, it receives the positions at t and the displacements to t + 1. A point rests before its first

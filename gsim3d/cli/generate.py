@@ -4,7 +4,7 @@ worlds:
   elastic   soft bodies fall on a round ground
   rigid     rigid bodies are thrown on a round ground
   cloth     soft bodies fall on a cloth with four fixed corners
-  push      a round pusher moves one to three bodies over the ground; its positions are recorded (actions.npz)
+  push      a round pusher moves one to three bodies over the ground; 27 points of it are recorded (actions.npz)
   cloth-grip  one or two grippers move a cloth or lay it down; their positions are recorded
   hands     two hands of 21 keypoints take, carry and put down a body; their keypoints are recorded
 

@@ -29,16 +29,14 @@ def read_actions(folder: Path, n_steps: int, problems: Problems) -> RecordedActi
     if not file.exists():
         return None
     try:
-        arrays = _arrays(read_file(file, MAX_BYTES))
+        positions, types = _arrays(read_file(file, MAX_BYTES))
     except InputError as error:
         problems.add(str(error))
         return None
     except UNREADABLE as error:
         problems.add(f"{file} cannot be read: {str(error)[:200]}")
         return None
-    positions, types = arrays
-    problem = _problem(positions, types, n_steps)
-    if problem is not None:
+    if problem := _problem(positions, types, n_steps):
         problems.add(f"{file}: {problem}")
         return None
     return RecordedActions(positions.astype(np.float64), tuple(map(str, types)), np.ones(positions.shape[:2], bool))

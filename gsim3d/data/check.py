@@ -244,8 +244,7 @@ def _draw_scene(tile: np.ndarray, scene: Scene, cam: int, step: int, zoom: float
         end = line(foot, foot + np.eye(3)[axis] * 0.3 * (high - low).min(), color, 2)
         if end is not None:
             _write(tile, name, (end + 2).tolist(), color)
-    if scene.recording.actions is not None:
-        actions = scene.recording.actions
+    if (actions := scene.recording.actions) is not None:
         pixels, depth = project(actions.positions[step][actions.present[step]], viewmat, K)
         for pixel in pixels[depth > 1e-3].clip(-MAX_COORDINATE, MAX_COORDINATE).round().astype(int):
             cv2.circle(tile, pixel.tolist(), 2, ACTOR, -1, cv2.LINE_AA)

@@ -101,8 +101,8 @@ class Dynamics(nn.Module):
 
     @contextlib.contextmanager
     def moving_at_most(self, n_rows: int) -> Iterator[None]:
-        """Context in which no scene has more than ``n_rows`` movable particles: a GPU then pads priors to this size
-        without a device sync. A CPU counts them."""
+        """Context in which no scene has more than ``n_rows`` movable particles beside action particles: a GPU then pads
+        priors to this size without a device sync. A CPU counts them."""
         before, self._most_movable = self._most_movable, n_rows
         try:
             yield
@@ -257,9 +257,10 @@ class Dynamics(nn.Module):
         state: Callable[[], Particles] | None = None,
     ) -> StepContext:
         """The context of priors for a step from ``particles``, of which ``state`` returns the newest."""
-        config, most = self.config, self._most_movable
+        n_points = 0 if particles.actions is None else particles.actions.n_points  # movable, too
+        most = None if self._most_movable is None else self._most_movable + n_points
         options = {"most_movable": most, "changes": changes, "rows": self.layout.rows, "state": state}
-        return StepContext(particles, self.priors, config.grid_size, 2**config.history_bits, **options)
+        return StepContext(particles, self.priors, self.config.grid_size, 2**self.config.history_bits, **options)
 
     def _with_initial_latents(self, history: Particles, changes: Mapping[str, str]) -> Particles:
         """For a relightable background, resets the dynamic latents of frozen particles, and of bodies if their latents

@@ -70,7 +70,7 @@ class ModelScenes(Scenes):
     """Scenes side by side in one learned simulator, in one batch.
 
     Particles of actors move as given. A model with action particles of the scenes' ``actor_type`` also has the actors'
-    centers in its input; for others, the particles are kinematic (:class:`gsim3d.effects.actors.Actor`). Centers of
+    points in its input; for others, the particles are kinematic (:class:`gsim3d.effects.actors.Actor`). Centers of
     bodies follow the rigid motion that fits their points best.
 
     Args:
@@ -153,10 +153,9 @@ class ModelScenes(Scenes):
         self.state = ModelState(self._reduced(append_step(before, step, self.plan.history)), path[:, 1:])
 
     def _acted(self, before: Particles, path: Tensor) -> Particles:
-        """The step that follows with action particles on ``path`` [n, L + 1, A, 3]."""
-        table = before.clouds
-        newest = {table.scenes[q]: table.steps[q] for q in newest_clouds(table)}
-        first = tuple(newest[scene] + 2 - path.shape[1] for scene in range(self.count))
+        """The step that follows with the points of actors whose centers are on ``path`` [n, L + 1, A, 3]."""
+        path = (path[:, :, :, None] + self._offsets).flatten(2, 3)
+        first = tuple(before.clouds.steps[q] + 2 - path.shape[1] for q in newest_clouds(before.clouds))
         types = torch.zeros(path.shape[:3], dtype=torch.int64, device=self.device)
         acting = dataclasses.replace(before, actions=Actions(path.float(), types, (self._type,), first))
         return dataclasses.replace(self.simulator.rollout(acting, 1, self.plan, wrap=self._wrap)[0], actions=None)
@@ -281,9 +280,9 @@ class ModelScenes(Scenes):
             self._rest = torch.zeros(self.count, N_PARTICLES, 3, dtype=torch.float64, device=self.device)
             self._members = torch.zeros(self.count, self.most_bodies, N_PARTICLES, device=self.device).double()
             self._centers = torch.full((self.count, self.most_bodies, 3), torch.nan, device=self.device).double()
-            actors = next(iter(started.values())).actors
-            positions = torch.zeros(self.count, length, *actors.shape[1:], device=self.device).double()
-            self._type = next(iter(started.values())).scene.actor_type
+            one = next(iter(started.values()))
+            positions = torch.zeros(self.count, length, *one.actors.shape[1:], device=self.device).double()
+            self._type, self._offsets = one.scene.actor_type, torch.from_numpy(one.scene.actor_points).to(self.device)
         else:
             old, positions = self.state.particles, self.state.actors.clone()
             kept = old.select_clouds([q for q, scene in enumerate(old.clouds.scenes) if scene not in started])

@@ -33,7 +33,7 @@ class PushScene(TrueScene):
         simulation: the bodies and the pusher.
     """
 
-    actor_type = "pusher"
+    actor_type, actor_points = "pusher", pushing.PUSHER_POINTS
 
     def __init__(self, bodies: Sequence[pushing.SceneBody], pusher: np.ndarray, goal: np.ndarray):
         surface, self._sphere = pushing.pusher_surface()
@@ -53,8 +53,7 @@ class PushScene(TrueScene):
         return self.simulation.centers
 
     def vertices(self) -> list[np.ndarray]:
-        nodes = self.simulation.nodes()
-        bodies = [bound.move(frame) for bound, frame in zip(self._bound, nodes, strict=True)]
+        bodies = [bound.move(frame) for bound, frame in zip(self._bound, self.simulation.nodes(), strict=True)]
         return [*bodies, self._sphere + self.simulation.pusher]
 
     def mark(self, rng: np.random.Generator) -> None:
@@ -63,8 +62,7 @@ class PushScene(TrueScene):
         self._points = [frame.bind(points) for frame, points in zip(self._frames, chosen, strict=True)]
 
     def points(self) -> np.ndarray:
-        nodes = self.simulation.nodes()
-        moved = [points.move(frame) for points, frame in zip(self._points, nodes, strict=True)]
+        moved = [points.move(frame) for points, frame in zip(self._points, self.simulation.nodes(), strict=True)]
         return np.concatenate(moved)[:N_PARTICLES]
 
     def move(self, velocities: np.ndarray) -> None:

@@ -30,10 +30,12 @@ class TrueScene(ABC):
         surfaces: of the bodies, then of the actors.
         n_bodies: number of bodies.
         actor_type: type of the points of actors, for models with action particles.
+        actor_points: these points relative to the actor's center [P, 3] in metres.
         grip: metres; particles of bodies nearer to an actor's center move with it.
     """
 
     actor_type = ""
+    actor_points = np.zeros((1, 3))
     grip = 0.0
 
     def __init__(self, goal: np.ndarray, surfaces: Sequence[render.Surface], n_bodies: int):

@@ -1,4 +1,4 @@
-"""The world push: a round pusher moves rigid bodies over the ground. Its actor is one point, the pusher's center.
+"""The world push: a round pusher moves rigid bodies over the ground. Its points: pushing.PUSHER_POINTS.
 
 Other worlds with actors: synth.gripping, synth.hands.
 """
@@ -39,7 +39,7 @@ class PushPolicy:
     legs: tuple[tuple[int, np.ndarray], ...]  #: (body, or -1 for none, and goal [2] in metres) in order
 
     def run(self, simulation: pushing.PushSimulation, n_frames: int) -> tuple[np.ndarray, np.ndarray]:
-        """Runs a simulation. Returns the nodes of the bodies [T, B, 4, 3] and the pusher's center [T, 3] in metres."""
+        """Runs a simulation. Returns nodes of the bodies [T, B, 4, 3] and the pusher's center [T, 1, 3] in metres."""
         nodes, places, leg = [simulation.nodes()], [simulation.pusher], 0
         for _ in range(1, n_frames):
             centers, at = simulation.centers[:, :2], simulation.pusher[:2]
@@ -49,7 +49,7 @@ class PushPolicy:
             simulation.step(self.speed * towards)
             nodes.append(simulation.nodes())
             places.append(simulation.pusher)
-        return np.stack(nodes), np.stack(places)
+        return np.stack(nodes), np.stack(places)[:, None]
 
     @staticmethod
     def _done(leg: tuple[int, np.ndarray], centers: np.ndarray, at: np.ndarray) -> bool:
@@ -90,7 +90,8 @@ class Push(World):
 
     name = "push"
     engines = ("mujoco",)
-    actors = ("pusher",)
+    actors = ("pusher",) * len(pushing.PUSHER_POINTS)
+    generator_version = 4
     unused = RESTING
 
     def check(self) -> None:
@@ -130,9 +131,9 @@ class Push(World):
         simulation = pushing.PushSimulation([body.body for body in drawn.bodies], pusher, self.fps)
         bound = [RigidFrame(rest[None]).bind(body.vertices) for rest, body in zip(simulation.rest_nodes, drawn.bodies)]
         nodes, places = drawn.policy.run(simulation, self.n_frames)
-        moved = [np.stack([points.move(frame) for frame in nodes[:, b]]) for b, points in enumerate(bound)]
-        moved.append(pushing.pusher_surface()[1] + places[:, None])
-        return [*(RigidFrame(nodes[:, b]) for b in range(len(bound))), ParticleCloud(places[:, None])], moved
+        bodies = [RigidFrame(axes) for axes in nodes.swapaxes(0, 1)]
+        moved = [np.stack([points.move(axes) for axes in body.nodes]) for points, body in zip(bound, bodies)]
+        return [*bodies, ParticleCloud(places + pushing.PUSHER_POINTS)], [*moved, places + pushing.pusher_surface()[1]]
 
     def _check_trajectory(self, rig, drawn, moved):
         for vertices in moved[:-1]:

@@ -101,6 +101,7 @@ class World(ABC):
     far: float = 3.8  #: largest visible depth
 
     name = ""
+    generator_version = 3  # increased whenever the bytes for given options change
     engines = tuple(ENGINES)
     known_objects = OBJECTS
     unused = ()  # options without effect, which are refused
@@ -177,7 +178,7 @@ class World(ABC):
         unused = ["n_trajectories", "meshes"] + ["objects"] * (not others)
         unused += [field for field in LATER_OPTIONS if fields[field] == getattr(World, field)]
         fields = {field: value for field, value in fields.items() if field not in unused}
-        text = json.dumps([writer.GENERATOR_VERSION, self.name, fields, name], sort_keys=True)
+        text = json.dumps([self.generator_version, self.name, fields, name], sort_keys=True)
         digest = hashlib.sha256(text.encode())
         for path in self.meshes:
             if others or mesh_name(path) == name:
@@ -245,9 +246,9 @@ class World(ABC):
                 views=[renderer.draw(vertices) for vertices in zip(*moved)],
                 states={name: states(embedding) for name, embedding in zip(names, embeddings)},
                 extras={
-                    **{"world": self.name, "subset": self.subset, "engine": self.engine, "seed": self.seed},
-                    **{"attempt": attempt, "rejected": rejected, "ground_height": drawn.ground},
-                    "bodies": [body.facts for body in drawn.bodies],
+                    **{"generator_version": self.generator_version, "world": self.name, "subset": self.subset},
+                    **{"engine": self.engine, "seed": self.seed, "attempt": attempt, "rejected": rejected},
+                    **{"ground_height": drawn.ground, "bodies": [body.facts for body in drawn.bodies]},
                 },
                 fingerprint=self.fingerprint(name),
                 actions=actions,

@@ -24,7 +24,6 @@ from gsim3d.io.plain import parse_json
 from gsim3d.synth.cameras import Rig, workspace_origin
 from gsim3d.synth.render import View
 
-GENERATOR_VERSION = 3  # increased whenever the bytes for given options change
 FILE_TEMPLATE = "cam_{cam_ix}/{img_type}_{n_step:04d}"
 ACTIONS_FILE = "actions.npz"  # see gsim3d.data.actions
 PNG_COMPRESSION = 3
@@ -43,7 +42,7 @@ class Scene:
     rig: Rig  #: cameras
     views: list[View]  #: images of every frame
     states: dict[str, np.ndarray]  #: name of a body or "cloth" -> nodes of its embedding, float32 [T, ..., 3] in metres
-    extras: dict  #: additional keys of metadata.json
+    extras: dict  #: additional keys of metadata.json, generator_version among them
     fingerprint: str  #: hash of the options that the scene depends on
     actions: np.ndarray | None = None  #: positions of the actors' points, float32 [T, A, 3] in metres; None: no actors
     action_types: tuple[str, ...] = ()  #: type of each point
@@ -56,8 +55,7 @@ def scene_folder(out: Path, name: str, sample: int) -> Path:
 
 def is_finished(folder: Path, fingerprint: str) -> bool:
     """Whether ``folder`` holds a finished scene. Raises InputError if it was generated with other options."""
-    metadata = folder / "metadata.json"
-    if not metadata.is_file():
+    if not (folder / "metadata.json").is_file():
         return False
     if read_metadata(folder).get("fingerprint") != fingerprint:
         raise InputError(f"{folder} was generated with other options; choose another folder or remove it")
@@ -133,7 +131,7 @@ def _metadata(scene: Scene) -> dict:
         "origin": workspace_origin(rig).tolist(),
         "object": scene.object,
         "sample": scene.sample,
-        "generator_version": GENERATOR_VERSION,
+        "generator_version": scene.extras["generator_version"],
         "fingerprint": scene.fingerprint,
         **({} if scene.views[0].depth is None else {"depth_unit": DEPTH_UNIT}),
         **scene.extras,
@@ -150,7 +148,7 @@ def write_manifest(out: Path, folders: list[Path], settings: dict) -> dict:
             key: metadata[key] for key in ("states_sha256", "images_sha256", "fingerprint", "attempt")
         }
     manifest = {
-        "generator_version": GENERATOR_VERSION,
+        "generator_version": metadata["generator_version"],
         "settings": settings,
         "machine": {"processor": processor_name(), "system": platform.platform(), "python": platform.python_version()},
         "versions": {package: version_of(package) or "absent" for package in PACKAGES},

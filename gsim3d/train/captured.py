@@ -182,9 +182,8 @@ class CapturedLoss:
     def prepare(self, batch: Batch) -> Prepared:
         """Counts the particles of a batch; synchronises the device, also while a graph runs. Raises InputError or
         NumericalError if the batch is not a valid input of the encoder."""
-        context = batch.context
+        context, masks = batch.context, batch.context.masks
         n_clouds, (n_images, _, *size) = context.cloud_scene.shape[0], context.images.shape
-        masks = context.masks
         if masks is None:
             masks = torch.ones(n_images, *size, dtype=torch.bool, device=context.images.device)
         all_move = context.dynamic is None or self.plan.spec.dynamics.background == "dynamic"

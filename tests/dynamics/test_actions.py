@@ -13,7 +13,7 @@ from gsim3d.evaluate.plan_costs import Workload, predicted_cost
 from gsim3d.io import read_particles, write_particles
 from gsim3d.presets import ModelConfig
 from gsim3d.pretrained.loading import with_weights
-from gsim3d.priors import InertiaConfig, VelocityConfig
+from gsim3d.priors import InertiaConfig, ProximityConfig, VelocityConfig
 from gsim3d.simulator import Simulator
 from gsim3d.state import ASLEEP, DYNAMIC
 from tests.asserts import assert_same_bits
@@ -216,6 +216,17 @@ def test_captured_rollouts_read_the_actions_of_each_call(name):
         assert found[-1].actions is one.actions
     with pytest.raises(InputError, match=r"state.actions must have as many points"):
         captured(given(state, walks(state, ("hand",))))
+
+
+def test_captured_rollouts_have_room_for_many_points_in_priors():
+    """A prior's padding counts action particles beside the movable particles of a scene."""
+    dynamics = dataclasses.replace(CONFIG.dynamics, priors=(ProximityConfig(),))
+    simulator, state, _ = setting(acting(dataclasses.replace(CONFIG, dynamics=dynamics)))
+    one = given(state, walks(state, 14 * TYPES))
+    captured = CapturedRollout(simulator, one, STEPS, simulator.plan(), factor=1.0)
+    for a, b in zip(captured(one).steps, rollout(simulator, one), strict=True):
+        torch.testing.assert_close(a.means, b.means)
+        torch.testing.assert_close(a.dynamic_latents, b.dynamic_latents)
 
 
 def test_points_rest_outside_of_their_steps():

@@ -29,6 +29,7 @@ from gsim3d.envs.push_planning import GoalCost, ModelDynamics  # noqa: E402
 from gsim3d.envs.scenes import task_rig  # noqa: E402
 from gsim3d.planning import GradientDescent  # noqa: E402
 from gsim3d.planning.costs import image_distance  # noqa: E402
+from gsim3d.synth.worlds import build_world  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 TASKS = ("PushToGoal", "PushClear", "ThrowToTarget", "ClothCover")
@@ -317,6 +318,42 @@ def test_models_with_action_particles_read_the_actors_path():
     assert (ends[0].means - ends[1].means)[~first & bodies].abs().max() > 1e-6
     known = scenes.state.actors[1, -3:, 0]
     assert torch.allclose(known.diff(dim=0)[:, :2], given[1] / FPS)
+
+
+def test_models_read_the_points_that_the_world_records():
+    """Of a pusher with the same centers; gradients of the coming ones reach its velocity."""
+    scenes, read = scenes_of(1, EffectsSpec(DynamicsEffects(actions=("pusher",))), actions=("pusher",)), []
+    length, rollout = scenes.state.actors.shape[1], scenes.simulator.rollout
+    world = build_world("push", "mini", {"n_cams": 2, "n_frames": length + 1})
+    points = torch.from_numpy(world.simulate(world.draw("box", 0, 0))[0][-1].nodes)
+    assert points.shape == (length + 1, 27, 3)
+    path = points[:, :1]
+    scenes.state = dataclasses.replace(scenes.state, actors=path[None, :-1])
+    scenes.simulator.rollout = lambda state, *given, **options: (
+        read.append(state.actions) or rollout(state, *given, **options)
+    )
+    velocities = ((path[-1] - path[-2]) * FPS)[None].requires_grad_()
+    scenes.move(velocities)
+    (actions,) = read
+    assert actions.names == ("pusher",) and not actions.types.any()
+    assert (actions.positions - points).abs().max() < 1e-6
+    assert torch.allclose(scenes.actors(), path[None, -1]) and scenes.state.actors.shape == (1, length, 1, 3)
+    (slope,) = torch.autograd.grad(actions.positions.sum(), velocities, retain_graph=True)
+    assert torch.allclose(slope, torch.full_like(slope, 27 / FPS))
+    newest = last_steps(scenes.state.particles, 1)
+    bodies = newest.means[(newest.activity == DYNAMIC) & (newest.actor < 0)]
+    (slope,) = torch.autograd.grad(bodies.sum(), velocities)
+    assert slope.isfinite().all() and slope.abs().min() > 0
+
+
+def test_points_of_several_actors_stay_together():
+    scenes = scenes_of(1)
+    scenes._offsets = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 0.5]]).double()
+    read, centers = [], torch.tensor([[[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]]).double()[None].expand(1, 3, -1, -1)
+    scenes.simulator.rollout = lambda state, *_, **__: read.append(state.actions) or [state]
+    scenes._acted(scenes.state.particles, centers)
+    wanted = [[1.0, 0.0, 0.0], [1.0, 0.0, 0.5], [2.0, 0.0, 0.0], [2.0, 0.0, 0.5]]
+    assert read[0].positions.shape == (1, 3, 4, 3) and read[0].positions[0, 0].tolist() == wanted
 
 
 def test_without_known_centers_they_are_the_middles_of_the_particles():

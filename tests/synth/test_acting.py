@@ -1,4 +1,6 @@
-"""Worlds with actors: recorded positions, lengths of motions, determinism, and files that check-data accepts."""
+"""Worlds with actors: recorded points, lengths of motions, determinism, and files that check-data accepts."""
+
+import json
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from gsim3d.synth import generate
 from gsim3d.synth.pushing import PUSHER_RADIUS
 from gsim3d.synth.scene_setup import Unstable
 from gsim3d.synth.world import Rejected
-from gsim3d.synth.worlds import build_world
+from gsim3d.synth.worlds import WORLDS, build_world
 
 SMALL = {"image_size": 32, "n_frames": 6, "n_cams": 2, "n_trajectories": 2, "samples": 1}
 
@@ -20,20 +22,37 @@ def pushes(tmp_path_factory):
     return generate(tmp_path_factory.mktemp("pushes"), "push", processes=1, progress=False, **SMALL).folders
 
 
-def test_push_scenes_record_the_center_of_the_pusher(pushes):
+def test_push_scenes_record_the_center_of_the_pusher_and_points_on_its_surface(pushes):
     for folder in pushes:
         assert not check_scene(folder).problems
         scene, states = Scene.open(folder), np.load(folder / "states.npz")
         actions = scene.recording.actions
-        assert actions.types == ("pusher",) and actions.positions.shape == (6, 1, 3)
+        assert actions.types == ("pusher",) * 27 and actions.positions.shape == (6, 27, 3)
         np.testing.assert_array_equal(actions.positions, states["actors"])
-        np.testing.assert_allclose(actions.positions[..., 2], PUSHER_RADIUS, atol=1e-6)
+        np.testing.assert_allclose(actions.positions[:, 0, 2], PUSHER_RADIUS, atol=1e-6)
+        arms = actions.positions[:, 1:] - actions.positions[:, :1]
+        np.testing.assert_allclose(np.linalg.norm(arms, axis=2), PUSHER_RADIUS, atol=1e-6)
+        np.testing.assert_allclose(arms, np.broadcast_to(arms[0], arms.shape), atol=1e-6)  # it does not turn
+        ways = {tuple(way) for way in np.sign(arms[0].round(5)).astype(int).tolist()}
+        assert len(ways) == 26 and (0, 0, 0) not in ways
         steps = np.linalg.norm(np.diff(actions.positions[:, 0], axis=0), axis=1) * scene.fps
         assert (steps < 0.5 + 1e-5).all() and (steps > 0.3 - 1e-5).all()
         seen = scene.cameras_at([0], [3])
         local = seen.viewmats[0].double().numpy() @ np.array([*actions.positions[3, 0], 1.0])
         x, y = (seen.Ks[0].double().numpy() @ local[:3])[:2] / local[2]
         assert scene.segmentation([0], [3])[0, 0, int(y), int(x)] == 3  # it is seen as a body
+
+
+def test_sets_with_other_points_have_another_version(pushes):
+    """Sets of push whose only point is the center are not continued; those of other worlds are."""
+    manifest = json.loads((pushes[0].parents[1] / "manifest.json").read_text())
+    facts = json.loads((pushes[0] / "metadata.json").read_text())
+    versions = {name: build_world(name, "mini", {}).generator_version for name in WORLDS}
+    assert manifest["generator_version"] == facts["generator_version"] == versions.pop("push") == 4
+    assert set(versions.values()) == {3}
+    world = build_world("push", "mini", {})
+    older = type("Older", (type(world),), {"generator_version": 3})()
+    assert older.fingerprint("box") != type(world)().fingerprint("box")
 
 
 def test_pushes_are_long_and_their_pushers_start_clear_of_bodies():
