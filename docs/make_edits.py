@@ -4,9 +4,10 @@
     python docs/make_edits.py elastic-small runs/held_out/validation/elastic/held_out --out runs/edits --device cuda
 
 Written to OUT: NAME.edits.json with its table, which is printed; a video and a picture of each of the first scenes, all
-edits beside each other. A scene that is measured already, with these weights, is not measured again. Shadows are those
-of generated scenes: how much darker the ground is where the lamp and the predicted body want it, over what the renderer
-casts. NAME.edits.json and pictures in docs/results/models are shown on the page of the model.
+edits beside each other. A scene that is measured already, with these weights, is not measured again. Shapes and heights
+are those of particles that do not end below the ground. Shadows are those of generated scenes: how much darker the
+ground is where the lamp and the predicted body want it, over what the renderer casts. NAME.edits.json and pictures in
+docs/results/models are shown on the page of the model.
 """
 
 import argparse
@@ -41,7 +42,9 @@ CAST = 1 - AMBIENT / (AMBIENT + DIFFUSE * LIGHT_DIRECTION[2])  # share of the li
 DISC, SPACING, NEAR, FAR = 1.1, 0.03, 0.03, 0.25  # metres: of the ground; in a shadow nearer than NEAR, lit beyond FAR
 WANTED = {  # number -> what it is, and its target
     "fall": ("fall without ground over free fall, 20 steps", "0.95 to 1.05"),
-    "shape_cm": ("change of shape, cm", ""),
+    "through": ("particles that end below the ground, %", "0"),
+    "shape_cm": ("change of shape, cm", "that of the truth"),
+    "true_cm": ("change of shape of the truth, cm", ""),
     "copies_cm": ("change of shape of the worst copy, cm", "at most 2"),
     "above_cm": ("lowest points above the raised ground at the end, cm", "0"),
     **{f"shadow {name}": (f"shadow over a whole one, {name}", "1") for name in LIT},
@@ -97,7 +100,7 @@ def measured(restored: Restored, scene: Scene, out: Path | None) -> dict[str, fl
         points[name] = moving_points(made.particles, future)
         if operation is None:
             heights = [moving_points(made.particles, [step])[0, :, 2].mean().item() for step in range(n_given)]
-    found = numbers_of_edits(points, heights, scene.fps)
+    found = numbers_of_edits(points, heights, scene, n_given)
     for name in LIT if points["as it is"].shape[1] else ():
         level, cast = RAISE * (name == "ground raised"), []
         for step in range(4, n_future, 5):

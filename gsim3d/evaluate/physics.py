@@ -132,12 +132,11 @@ def moving_points(particles: Particles, steps: Sequence[int]) -> Tensor:
     return torch.stack([cloud.means[moving] for cloud in clouds]).cpu()
 
 
-def shape_change(points: Tensor, copies: int = 1) -> float:
-    """Returns the largest rms in metres of ``copies`` bodies to their first shapes at the last step of ``points``
-    [S, N, 3], those of one copy after those of another."""
-    bodies = torch.arange(copies).repeat_interleave(points.shape[1] // copies)
+def shape_change(points: Tensor, bodies: Tensor) -> float:
+    """Returns the largest rms in metres of ``bodies`` (int64 [N]) to their first shapes at the last step of ``points``
+    [S, N, 3]; NaN without points."""
     last = _residuals(points[[0, -1]].double(), bodies)[0]
-    return max(last[bodies == body].square().mean().sqrt().item() for body in range(copies))
+    return max((last[bodies == body].square().mean().sqrt().item() for body in bodies.unique()), default=math.nan)
 
 
 def fall_ratio(given: Sequence[float], height: float, n_steps: int, fps: float) -> float | None:
@@ -159,9 +158,8 @@ def true_states(scene: Scene) -> list[Tensor] | None:
     file = scene.path / "states.npz"
     if not file.is_file() or scene.fitting.unit_cameras:
         return None
-    with naming(f"{file}: cannot be read", UNREADABLE):
-        with np.load(file, allow_pickle=False) as states:
-            found = [torch.from_numpy(states[name]) for name in states.files if name != "actors"]
+    with naming(f"{file}: cannot be read", UNREADABLE), np.load(file, allow_pickle=False) as states:
+        found = [torch.from_numpy(states[name]) for name in states.files if name != "actors"]
     for nodes in found:
         if nodes.ndim < 3 or nodes.shape[-1] != 3 or not nodes.isfinite().all():
             raise InputError(f"{file}: each body must be [T, ..., 3] finite numbers; got {list(nodes.shape)}")

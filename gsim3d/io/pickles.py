@@ -49,6 +49,5 @@ def _popped(stack: list, before: list) -> list:
         while (top := stack.pop()) is not _MARK:
             parts.append(top)
         before = before[: before.index(pickletools.markobject)]
-    for _ in before:
-        parts.append(stack.pop())
+    parts.extend(stack.pop() for _ in before)
     return parts[::-1]

@@ -14,7 +14,6 @@ from gsim3d.ops._register import fakes, refuse
 CELLS: int = constants["validate_cells"]  # of a workspace along each axis
 OUTSIDE: int = constants["validate_outside"]  # bits of a status
 FAST: int = constants["validate_fast"]
-MAX_FIELDS: int = constants["validate_max_fields"]
 SUMS: tuple[str, ...] = constants["validate_sums"]
 _ROWS_A_PART: dict[str, int] = constants["validate_rows_a_part"]
 

@@ -35,7 +35,9 @@ COLUMNS = {  # key of the numbers -> title, decimals
     "seconds": ("s to fit", 1),
     "parameters": ("parameters", 0),
     "substeps": ("substeps a frame", 0),
+    "through": ("through the ground, %", 1),
     "shape_cm": ("shape, cm", 2),
+    "true_cm": ("true shape, cm", 2),
     "copies_cm": ("shape of copies, cm", 2),
     "fall": ("fall over free fall", 3),
     "above_cm": ("above raised ground, cm", 1),
@@ -45,8 +47,9 @@ CURVES = ("psnr_masked", "psnr_body", "ssim")
 EXPLAINED = f"""\
 PSNR in dB over predicted steps; masked: foreground, body: moving bodies. ±: standard error of paired differences over
 scenes; "=" marks differences within {LEAST:g} of them. Last: change of masked PSNR (Speed: of ms a step) since the run
-before in this folder. Edits: shape is the rms distance to the best rigid motion over all steps, of the worst copy; fall
-without ground over free fall, after 20 steps; above the raised ground: the lowest twentieth of the body at the end.
+before in this folder. Edits: of particles that end above the ground, shape is the rms distance to the best rigid motion
+over all steps, of the worst copy; above the raised ground: the lowest twentieth of them at the end. Fall without ground
+over free fall, after 20 steps.
 Paper: other data, which was never released, and other budgets: compare differences, not values.
 Cost: all seconds of a row, with scoring. "ms a step" includes rendering; "s to fit" of a method that is fitted to each
 scene are those of its start, dynamics and images. Parameters: weights, or fitted values; baselines add none."""

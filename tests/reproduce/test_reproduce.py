@@ -9,17 +9,19 @@ import torch
 
 from gsim3d.baselines import BASELINES
 from gsim3d.cli.main import main
-from gsim3d.data import find_scenes
+from gsim3d.data import Scene, find_scenes
 from gsim3d.evaluate.ablations import load_ablations
 from gsim3d.evaluate.compare import paired
+from gsim3d.evaluate.physics import true_states
 from gsim3d.evaluate.protocol import score_scene
 from gsim3d.evaluate.report import summarize
 from gsim3d.io.files import read_yaml
 from gsim3d.io.settings import from_dict
 from gsim3d.reproduce import page, run
 from gsim3d.reproduce.cells import from_json, to_json
-from gsim3d.reproduce.entries import ENTRIES
+from gsim3d.reproduce.entries import EDITED, ENTRIES, numbers_of_edits
 from gsim3d.reproduce.run import NO_TIME, Job, reproduce
+from gsim3d.synth import generate
 from gsim3d.train.config import TrainConfig
 from gsim3d.train.restore import restore
 from tests.tiny_scenes import write_scenes
@@ -70,7 +72,8 @@ def test_every_row_that_the_data_allow(first, work):
     assert lines[MAIN, "one"]["paper_other_data"] == "33.15 ± 3.51" and not lines[MAIN, "copy"]["paper_other_data"]
     assert lines[MAIN, "two"]["numbers"]["step_ms"] == lines["Speed", "two"]["numbers"]["step_ms"] > 0
     assert lines[MAIN, "two"]["numbers"]["parameters"] > lines[MAIN, "constant"]["numbers"]["parameters"] == 0
-    assert {"shape_cm", "copies_cm", "above_cm"} == lines["Edits", "one"]["numbers"].keys()  # too short for a fall
+    edits = lines["Edits", "one"]["numbers"]  # too short for a fall, and without known states
+    assert edits.keys() == {"through", "shape_cm", "copies_cm", "above_cm"}
     page, missing = (work / "out" / "reproduce.md").read_text(), " ".join(content["missing"])
     for text in ("momentum [m/s] | two", "other data", "(figures/main-table-elastic-curves.png)"):
         assert text in page, text
@@ -78,6 +81,32 @@ def test_every_row_that_the_data_allow(first, work):
     assert "trained with 2 input steps of 2 cameras: one, history 2 (2)" in missing
     fewer = page.split("## Input cameras")[1].split("##")[0]
     assert fewer.index("| two |") < fewer.index("| two, cameras 1 |") and "| one, cameras 1 |" in fewer
+
+
+def test_numbers_of_edits(tmp_path):
+    """A rigid body of which a tenth goes on through the ground; its copy is 10 % lower at the end."""
+    options = {"n_trajectories": 1, "n_frames": 6, "objects": ("capsule",), "processes": 1, "progress": False}
+    scene = Scene.open(generate(tmp_path, "elastic", preset="published", **options).folders[0])
+    body = true_states(scene)[0][2].double().flatten(0, -2).mean(0) + 0.1 * torch.randn(
+        100, 3, generator=torch.Generator().manual_seed(0)
+    )
+    still, lower = (torch.stack([body, body * torch.tensor(scale)]) for scale in ([1, 1, 1.0], [1, 1, 0.9]))
+    fallen = torch.where(torch.arange(100)[:, None] < 10, torch.tensor([0, 0, -3.0]), 0.0)
+    alone, raised = still.clone(), still.clone()
+    alone[1] += fallen
+    raised[1, :, 2] += 0.3 - body[:, 2].quantile(0.05)
+    points = dict.fromkeys(EDITED, still) | {"as it is": alone, "ground raised": raised}
+    points["duplicated"] = torch.cat([alone, lower], 1)
+    found = numbers_of_edits(points, [1.0, 0.9], scene, 2)
+    assert found["through"] == pytest.approx(100 * 20 / 400)
+    assert found["shape_cm"] == pytest.approx(0, abs=1e-9) and found["true_cm"] == pytest.approx(0, abs=1e-4)
+    assert 0.5 < found["copies_cm"] < 2
+    assert found["above_cm"] == pytest.approx(10) and "fall" not in found
+    points["ground raised"] = alone  # stays where it was, as if the ground were not there
+    sunk = numbers_of_edits(points, [1.0, 0.9], scene, 2)
+    assert sunk["through"] > found["through"]
+    points["as it is"] = points["duplicated"] = points["ground raised"] = still - torch.tensor([0, 0, 9.0])
+    assert numbers_of_edits(points, [1.0, 0.9], scene, 2).keys() == {"through", "true_cm"}
 
 
 def test_scores_are_those_of_evaluate(first, work):

@@ -395,7 +395,7 @@ def test_the_next_run_has_the_capacity_that_graphs_needed(store, tmp_path):
             load_into(second, tmp_path / "state", NAME)
 
 
-@pytest.mark.parametrize("arm", ["velocity", "pure", "priors", "gns", "waves"])
+@pytest.mark.parametrize("arm", ["velocity", "pure", "priors", "gns"])
 @pytest.mark.parametrize("world", WORLDS)
 def test_recipes_are_sound(world, arm):
     if (world, arm) == ("push", "priors"):
@@ -413,7 +413,7 @@ def test_recipes_are_sound(world, arm):
     hand_made = model.position_features, "inertia" in kinds, "contact" in kinds
     assert hand_made == ((1, 1, world != "cloth") if arm == "priors" else (0, 0, 0))
     assert ("velocity" in kinds) == (arm not in ("pure", "priors", "gns"))
-    assert ("position_waves" in kinds) == (arm == "priors" or (world, arm) == ("elastic", "waves"))
+    assert ("position_waves" in kinds) == (arm == "priors")
     assert (model.network == "graph network") == (arm == "gns")
     acting = made.train.effects.get("dynamics", {}).get("actions", [])
     assert model.actions == tuple(acting) == stream.effects().dynamics.actions
