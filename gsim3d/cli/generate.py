@@ -109,8 +109,8 @@ def run(args: argparse.Namespace) -> int:
 
     options = {k: tuple(v) if isinstance(v, list) else v for k, v in vars(args).items() if v is not None}
     report = generate(options.pop("out"), options.pop("world"), progress=not options.pop("quiet"), **options)
-    kept = len(report.folders) - report.n_made
-    print(f"{len(report.folders)} scenes in {args.out}: {report.n_made} generated, {kept} kept")
+    count, n_made = len(report.folders), report.n_made
+    print(f"{count} scene{'s' * (count > 1)} in {args.out}: {n_made} generated, {count - n_made} kept")
     for reason, count in sorted(report.rejected.items()):
-        print(f"  {count} draws rejected: {reason}")
+        print(f"  {count} draw{'s' * (count > 1)} rejected: {reason}")
     return 0

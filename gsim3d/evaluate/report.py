@@ -194,7 +194,8 @@ def markdown(summary: dict, dataset: str) -> str:
             if any(f"{key}.{m}" in summary for m in by_step):
                 lines.append(_row([name, method, *(_number(summary.get(f"{key}.{m}"), m) for m in by_step)]))
     lines += physics_table(summary)
-    lines += ["", f"{summary['n_scenes']} scenes; {summary['n_encoded_steps']} steps given, "
+    n_scenes = f"{summary['n_scenes']} scene{'s' * (summary['n_scenes'] > 1)}"
+    lines += ["", f"{n_scenes}; {summary['n_encoded_steps']} steps given, "
               f"{summary['n_future_steps']} predicted. Mean over steps of the mean over scenes ± mean over steps of "
               f"the standard deviation between scenes. Of PSNR, {REGIONS}."]  # fmt: skip
     return "\n".join([*lines, *(f"\n{note}" for note in [*facts(summary), *notes(summary)])]) + "\n"
@@ -236,8 +237,8 @@ def table(summary: dict) -> str:
         rows += [(f"{method}, predicted steps", f"{prefix}future"), ("  second half of them", f"{prefix}future_late")]
     width = max([34, *(len(name) + 2 for name, _ in rows)])
     lines = [
-        f"{summary['n_scenes']} scenes, {summary['n_encoded_steps']} steps given, {summary['n_future_steps']} predicted"
-        f" (PSNR in dB; {REGIONS})",
+        f"{summary['n_scenes']} scene{'s' * (summary['n_scenes'] > 1)}, {summary['n_encoded_steps']} steps given, "
+        f"{summary['n_future_steps']} predicted (PSNR in dB; {REGIONS})",
         *facts(summary),
         "",
         f"{'':{width}}" + "".join(f"{METRICS[m].label:>13}" for m in shown),

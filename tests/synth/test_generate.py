@@ -538,7 +538,7 @@ def test_generate_command(tmp_path, capsys):
     text = f"elastic --out {tmp_path / 'out'} --size 16 --frames 2 --fps 30 --trajectories 1 --objects none"
     text += f" --mesh {mesh} --quiet"
     assert run(parser.parse_args([*text.split(), "--drop", "0.5", "0.6", "--background", "white"])) == 0
-    assert "1 scenes in" in capsys.readouterr().out
+    assert "1 scene in" in capsys.readouterr().out
     scene = Scene.open(tmp_path / "out" / "pyramid" / "0000")
     assert (scene.n_steps, scene.fps, scene.width) == (2, 30.0, 16)
     assert (scene.images([0], [0])[0, 0, :, 0, 0] == 255).all()
