@@ -20,7 +20,7 @@ from gsim3d.evaluate.protocol import default_views, predict
 from gsim3d.io.checkpoint import Checkpoint
 from gsim3d.pretrained import names
 from gsim3d.train.config import DataConfig
-from gsim3d.train.restore import Restored, build_simulator
+from gsim3d.train.restore import Restored, build_simulator, restore
 from tests.data.made_videos import trimmed, write_plain, write_scene as write_videos
 from tests.tiny_scenes import write_scene
 
@@ -195,6 +195,7 @@ def test_an_unknown_part_is_named(restored, tmp_path):
 
 @pytest.mark.skipif("elastic-small" not in names(), reason="no simulator is shipped")
 def test_shipped_model_reports_changes_in_one_line(tmp_path, capsys):
-    folder = rig(tmp_path / "scene", 3, size=16, fps=42.0)
+    near, far = restore("elastic-small", "cpu").data.near_far
+    folder = rig(tmp_path / "scene", 3, size=16, fps=42.0, near=near, far=far)
     assert main(["plan", str(folder), "elastic-small"]) == 0
     assert capsys.readouterr().err == "gsim3d: fitted to the model: images of 16x16 pixels scaled to 128x128\n"
