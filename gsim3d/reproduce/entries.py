@@ -130,9 +130,9 @@ def edit(case: Case) -> dict:
 
     Returns:
         Numbers as far as the scene has moving particles and steps: "through", percentage of them that end below the
-        ground, others as far as they do not; shapes as rms to the rigid motion over all steps, "shape_cm" as it is,
-        "true_cm" of the truth, "copies_cm" of the worst copy; "fall", the height lost without ground over that of free
-        fall, after FALL_STEPS; "above_cm", how far above the raised ground the body ends.
+        ground over three edits, the others without these; shapes as rms to the rigid motion over all steps, "shape_cm"
+        as it is, "true_cm" of the truth, "copies_cm" of the worst copy; "fall", the height lost without ground over
+        that of free fall, after FALL_STEPS; "above_cm", how far above the raised ground the body ends.
     """
     scene, cam = case.scene(), case.targets[:1]
     context = default_views(case.restored, scene, None, case.targets)[0]

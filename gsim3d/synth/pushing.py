@@ -20,8 +20,8 @@ DENSITY = 60.0  # kg/m^3 of the bounding box: light enough for the contacts of a
 FRICTION, BOUNCE = (0.4, 0.9), (0.1, 0.7)  # ranges for bodies that are not in synth.bodies.CONTACTS
 PUSHER_RADIUS, PUSHER_COLOR = 0.08, (0.85, 0.15, 0.1)
 # Points of the pusher as an actor, relative to its center [27, 3] in metres: the center, then 26 on the surface.
-_WAYS = np.array(sorted(product((-1.0, 0.0, 1.0), repeat=3), key=any))  # (0, 0, 0) comes first
-PUSHER_POINTS = PUSHER_RADIUS * _WAYS / np.linalg.norm(_WAYS, axis=1, keepdims=True).clip(1)
+_DIRECTIONS = np.array(sorted(product((-1.0, 0.0, 1.0), repeat=3), key=any))  # (0, 0, 0) comes first
+PUSHER_POINTS = PUSHER_RADIUS * _DIRECTIONS / np.linalg.norm(_DIRECTIONS, axis=1, keepdims=True).clip(1)
 SUBSTEP = 1 / 480  # largest time step in seconds
 SETTLE = 0.5  # seconds that are simulated before an episode, until bodies rest
 
