@@ -64,7 +64,7 @@ def is_asymmetric(spec: EffectsSpec, model: ModelConfig) -> bool:
 
 def _check_supported(spec: EffectsSpec, model: ModelConfig) -> None:
     dynamics, outputs = spec.dynamics, spec.outputs
-    known = model.dynamics.actions
+    known, is_symmetric = model.dynamics.actions, not model.dynamics.is_asymmetric
     unknown = [name for name in dynamics.actions if name not in known]
     refused = {
         "dynamics.actions": (
@@ -74,22 +74,17 @@ def _check_supported(spec: EffectsSpec, model: ModelConfig) -> None:
             bool(dynamics.actions and dynamics.sleep), "what actors touch must not sleep; leave sleep out"
         ),
         "dynamics.background asymmetric": (
-            dynamics.background == "asymmetric" and not model.dynamics.is_asymmetric,
-            "in this model frozen particles attend to all others",
+            dynamics.background == "asymmetric" and is_symmetric, "in this model frozen particles attend to all others"
         ),
         "dynamics.sleep.policy approx": (
-            dynamics.sleep and dynamics.sleep.policy == "approx" and not model.dynamics.is_asymmetric,
+            dynamics.sleep and dynamics.sleep.policy == "approx" and is_symmetric,
             "it needs a model with an asymmetric background; use the policy exact",
         ),
         "appearance.opacity_changes": (
             spec.appearance.opacity_changes and not model.dynamics.explicit, "this model does not predict opacities"
         ),
-        "outputs": (
-            not (outputs.rgb or outputs.depth or outputs.alpha or outputs.features), "no output is on"
-        ),
-        "outputs.features": (
-            outputs.features and model.renderer.latents == 0, "this model's particles have no latents"
-        ),
+        "outputs": (not (outputs.rgb or outputs.depth or outputs.alpha or outputs.features), "no output is on"),
+        "outputs.features": (outputs.features and not model.renderer.latents, "this model's particles have no latents"),
     }  # fmt: skip
     for name, (asked, why) in refused.items():
         if asked:

@@ -36,14 +36,9 @@ class PositionWaves(Prior, config=PositionWavesConfig):
         self.n_features = 6 * config.count
 
     def features(self, ctx: StepContext) -> Tensor:
-        return position_waves(ctx.history, self.config.count, self.config.longest)
-
-
-def position_waves(particles: Particles, count: int, longest: float) -> Tensor:
-    """Features [N, 6 count] of positions relative to the origin; ``longest`` is the largest wavelength in metres."""
-    angles = relative_positions(particles) * (2 * math.pi / longest)
-    angles = torch.stack([2**k * angles for k in range(count)], 1)
-    return torch.stack([angles.sin(), angles.cos()], 2).flatten(1).to(particles.means.dtype)
+        angles = relative_positions(ctx.history) * (2 * math.pi / self.config.longest)
+        angles = torch.stack([2**k * angles for k in range(self.config.count)], 1)
+        return torch.stack([angles.sin(), angles.cos()], 2).flatten(1).to(ctx.history.means.dtype)
 
 
 def relative_positions(particles: Particles) -> Tensor:

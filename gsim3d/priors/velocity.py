@@ -12,6 +12,7 @@ from gsim3d.priors.padding import PaddedClouds, Samples, Subset, mean_shift
 from gsim3d.state import Particles, constant
 
 SMOOTHING = 0.5  # share of the old mean velocity in the new one
+SLOW = 16  # a cell over the displacement in a step up to which features are about proportional: rolls count, too
 
 
 @dataclass(frozen=True)
@@ -23,14 +24,15 @@ class VelocityConfig(PriorConfig):
     """
 
     type = "velocity"
+    version: int = 2
     radius: float = 0.3
 
     RANGES = {"radius": (1e-6, 1e6)}
 
 
 class Velocity(Prior, config=VelocityConfig):
-    """Features of the newest particles: the last displacement v_1 and the mean velocity v_2. Predicted gains g [2, 3]
-    add g_1 v_1 + (1 + g_2) v_2 (elementwise) to a displacement.
+    """Features of the newest particles: asinh(SLOW v / cell) of the last displacement v_1 and the mean velocity v_2.
+    Predicted gains g [2, 3] add g_1 v_1 + (1 + g_2) v_2 (elementwise) to a displacement.
 
     The network then predicts changes of velocities, as graph network simulators do (Sanchez-Gonzalez et al. 2020), and
     reads motions below a cell, to which it rounds positions. In encoded clouds v_1 is the displacement of the mean of a
@@ -42,7 +44,7 @@ class Velocity(Prior, config=VelocityConfig):
 
     attributes = ("velocity", "mean_velocity")
     n_features = n_gains = 6
-    is_local = True
+    behind_norm = is_local = True
 
     def initialize(self, particles: Particles, ctx: StepContext, frames: Frames | None = None) -> Particles:
         if frames is None or ctx.is_empty:
@@ -52,7 +54,8 @@ class Velocity(Prior, config=VelocityConfig):
         return replace(particles, velocity=last, mean_velocity=mean)
 
     def features(self, ctx: StepContext) -> Tensor:
-        return ctx.scatter_newest(torch.cat([ctx.state.velocity, ctx.state.mean_velocity], 1)) / ctx.grid_size
+        both = torch.cat([ctx.state.velocity, ctx.state.mean_velocity], 1)
+        return ctx.scatter_newest((both * (SLOW / ctx.grid_size)).asinh())
 
     def move(self, motion: Motion, gains: Tensor, ctx: StepContext) -> Motion:
         g_1, g_2 = bounded_gains(gains).unbind(1)

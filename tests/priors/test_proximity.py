@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from gsim3d.priors import InertiaConfig, PositionWavesConfig, ProximityConfig
-from gsim3d.priors.position_waves import position_waves
 from gsim3d.state import ASLEEP, DYNAMIC, FROZEN, last_steps
 from tests.asserts import assert_close_relative_to_max, assert_same_bits
 from tests.dynamics.scenes import TINY, batch, make_dynamics, make_history, permute_rows
@@ -128,8 +127,8 @@ def test_network_reads_features(name):
 
 
 def test_position_waves():
-    history = above_ground([0.3])
-    waves = position_waves(history, 3, 4.0).unflatten(1, (3, 2, 3))
+    ctx = context(above_ground([0.3]), PositionWavesConfig(count=3), grid_size=1.0)
+    history, waves = ctx.history, ctx.priors.get("position_waves").features(ctx).unflatten(1, (3, 2, 3))
     places = history.means.double() - history.origin[0]
     for k in range(3):
         angles = 2 * torch.pi * places * 2**k / 4.0

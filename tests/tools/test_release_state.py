@@ -504,20 +504,6 @@ def test_committed_states_are_read_and_load(file, tmp_path, capsys):
     assert sum(not torch.equal(before[key], value) for key, value in trainer.parameters.items()) > 0.9 * len(before)
 
 
-def test_new_blocks_pass_on_what_they_read(first_run, store, tmp_path):
-    _, state, _ = first_run
-    depths = {"encoder_depths": [1, 1, 3], "decoder_depths": [2, 1]}
-    config, losses = dataclasses.replace(CONFIG, model={"dynamics": depths}), []
-    for given in (CONFIG, config):
-        trainer = RunTrainer(given, store, tmp_path / f"run{len(losses)}", "cpu")
-        load_into(trainer, state, NAME, differs=given is config)
-        trainer.begin_run(time.monotonic() + 60)
-        losses.append(trainer.train_step()["loss"])
-    assert losses[0] == losses[1]
-    assert trainer.new_parameters and all(".blocks." in name for name in trainer.new_parameters)
-    assert all(trainer.parameters[name].any() for name in trainer.new_parameters if "norm.weight" in name)
-
-
 def test_new_priors_begin_at_their_first_values(first_run, store, tmp_path):
     trainer, state, _ = first_run
     priors = [{"type": "position_waves", "count": 2}]

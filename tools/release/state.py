@@ -10,7 +10,6 @@ weights, which are less noisy than those of the last step, with first moments of
 import dataclasses
 import json
 import os
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -30,7 +29,6 @@ FORMAT = 2
 BLOCK = 64  # weights that share a scale
 LEVELS = 127
 PRIORS = "dynamics.priors."  # names of their parameters begin so
-BRANCH_ENDS = re.compile(r"(.+\.)(position\.norm|attention\.proj|mlp\.fc2)\.(weight|bias)")  # of a block
 CURVE = ("step", "windows", "seconds", "loss", "past_psnr", "future_psnr", "learning_rate")
 
 
@@ -92,8 +90,7 @@ def load_into(trainer: Trainer, folder: str | Path, name: str, *, differs: bool 
     Parameters of priors that the state's model did not have stay as they are; ``trainer.new_parameters`` names them.
 
     Args:
-        differs: the state is of another model: all parameters that it lacks, or has in another size, stay as they are;
-            blocks that it lacks pass on what they read.
+        differs: the state is of another model: all parameters that it lacks, or has in another size, stay as they are.
     Returns:
         The progress so far; of a new run, whose trainer stays as it is, where ``folder`` has no state.
     Raises:
@@ -110,9 +107,6 @@ def load_into(trainer: Trainer, folder: str | Path, name: str, *, differs: bool 
         trainer.new_parameters = [key for key in own if not _has(tensors, key, own[key].shape)]
         if not differs and (other := [key for key in trainer.new_parameters if not key.startswith(PRIORS)]):
             raise KeyError(f"it has no {other[0]} of shape {list(own[other[0]].shape)}")
-        for end in filter(None, map(BRANCH_ENDS.fullmatch, trainer.new_parameters)):
-            if f"{end[1]}norm1.weight" in trainer.new_parameters:
-                own[end[0]].zero_()
         known = own.keys() - set(trainer.new_parameters)
         weights = {key: _unpacked(tensors, key, own[key].shape) for key in known}
         trainer.simulator.load_state_dict(weights, strict=False)
