@@ -5,8 +5,8 @@ cloud's step, with latents
 
     e[type] + W d / grid_size
 
-of its learned embedding e and its displacement d to the next step, which is known also for the newest cloud. What the
-network predicts for action particles is not used.
+of its learned embedding e and its displacement d to the next step, which is known also for the newest cloud and is its
+velocity where particles have one. What the network predicts for action particles is not used.
 """
 
 import torch
@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from gsim3d.dynamics.config import DynamicsConfig
 from gsim3d.errors import InputError
-from gsim3d.state import ASLEEP, DYNAMIC, Actions, Particles, constant, joined_clouds, take_runs
+from gsim3d.state import ASLEEP, DYNAMIC, VELOCITIES, Actions, Particles, constant, joined_clouds, take_runs
 
 # Standard deviations of the initial weights. A point is one of hundreds of particles: of a single ball that moves as
 # prescribed, the preset tiny learned nothing from displacements in 3000 steps with 0.5, and enough in 1000 with 2.5.
@@ -55,14 +55,14 @@ class ActionParticles(nn.Module):
         index = self._index(actions, acting)
         (now, types), (coming, coming_types) = actions.at(table), actions.at(table, 1)
         now, types = now.to(like), index[types]
-        moved = (torch.where((coming_types < 0)[..., None], 0, coming.to(like) - now) / self.cell)[..., None]
-        latents = self.embedding[types.clamp_min(0)] + (moved * self.displacement).sum(-2)
+        moved = torch.where((coming_types < 0)[..., None], 0, coming.to(like) - now)
+        latents = self.embedding[types.clamp_min(0)] + ((moved / self.cell)[..., None] * self.displacement).sum(-2)
         latents = latents.flatten(0, 1).to(history.dynamic_latents)
         known = table.with_counts((actions.n_points,) * len(table))
         activity = torch.where(types.flatten() < 0, ASLEEP, DYNAMIC).to(torch.uint8)
-        dynamic, static = latents.split([self.n_dynamic, latents.shape[1] - self.n_dynamic], 1)
-        rows = now.flatten(0, 1), torch.ones_like(latents[:, 0]), dynamic, static
-        return Particles(*rows, *known.tensors, activity=activity, origin=history.origin, known=known)
+        rows = now.flatten(0, 1), torch.ones_like(latents[:, 0]), *latents.tensor_split([self.n_dynamic], 1)
+        moves = dict.fromkeys((n for n in VELOCITIES if getattr(history, n) is not None), moved.flatten(0, 1))
+        return Particles(*rows, *known.tensors, activity=activity, origin=history.origin, known=known, **moves)
 
     def _index(self, actions: Actions, acting: tuple[str, ...]) -> Tensor:
         """int64: index into ``types`` of each of the actions' types; -1 (also its last entry): not acting."""

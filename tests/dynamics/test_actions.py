@@ -97,6 +97,8 @@ def test_input_holds_positions_now_and_displacements_to_the_next_step(name, monk
             moved = (later - now) / simulator.config.dynamics.grid_size
             latents = module.embedding[[1, 0]] + moved @ module.displacement
             torch.testing.assert_close(history.latents[rows], latents)
+            for velocity in (history.velocity, history.mean_velocity) if name == "velocity" else ():
+                assert_same_bits(velocity[rows], later - now)
     free = rollout(simulator, state)
     changed = free[0].activity == DYNAMIC
     assert not torch.equal(free[0].means[changed], steps[0].means[changed])
