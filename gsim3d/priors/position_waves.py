@@ -19,13 +19,11 @@ class PositionWavesConfig(PriorConfig):
     Attributes:
         count: waves along each axis; each wavelength is half the previous one.
         longest: wavelength of the first wave in metres.
-        behind_norm: whether the features join behind the stem's norm, see :class:`gsim3d.priors.Prior`.
     """
 
     type = "position_waves"
     count: int = 4
     longest: float = 4.0
-    behind_norm: bool = False
 
     RANGES = {"count": (1, MOST_WAVES), "longest": (1e-6, 1e6)}
 
@@ -35,7 +33,7 @@ class PositionWaves(Prior, config=PositionWavesConfig):
 
     def __init__(self, config: PositionWavesConfig):
         super().__init__(config)
-        self.n_features, self.behind_norm = 6 * config.count, config.behind_norm
+        self.n_features = 6 * config.count
 
     def features(self, ctx: StepContext) -> Tensor:
         angles = relative_positions(ctx.history) * (2 * math.pi / self.config.longest)
