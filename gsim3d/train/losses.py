@@ -8,6 +8,7 @@ from gsim3d.evaluate.perceptual.lpips import LPIPS
 from gsim3d.train.config import LossConfig
 
 MAX_GAIN = 1.5
+LEAST_ERROR = 1e-5  # added to the errors whose logarithm is taken: 50 dB
 LEAST_WEIGHT = 1e-12  # lower bound of the total pixel weight of an image, so that empty images have error 0
 
 
@@ -30,7 +31,10 @@ def training_loss(
     if settings.image_gain:
         images = images * relative_gains(images.detach(), truth, targets.cameras, n_steps, weight)
     step = targets.cameras.image_cloud % n_steps
-    wrong = image_errors(images, truth, weight)
+    if settings.relative and shown is not None:
+        wrong = relative_errors(images, truth, shown, targets.valid)
+    else:
+        wrong = image_errors(images, truth, weight)
     if perceptual is not None:
         seen = images if targets.valid is None else torch.where(targets.valid[..., None], images, truth)
         wrong = wrong + settings.perceptual * perceptual(seen.permute(0, 3, 1, 2), targets.images)
@@ -62,6 +66,15 @@ def image_errors(pred: Tensor, target: Tensor, weight: Tensor | None = None) -> 
     if weight is None:
         return errors.mean((1, 2))
     return (errors * weight).sum((1, 2)) / weight.sum((1, 2)).clamp(min=LEAST_WEIGHT)
+
+
+def relative_errors(pred: Tensor, target: Tensor, bodies: Tensor, valid: Tensor | None = None) -> Tensor:
+    """Returns the sum [I] of the logarithms of the squared errors on ``bodies`` (bool [I, H, W]) and elsewhere, each a
+    mean over all pixels of the image, of images [I, H, W, C]; only ``valid`` pixels (bool [I, H, W]) are compared."""
+    errors = (pred - target).square().mean(-1)
+    errors = errors if valid is None else errors * valid
+    both = torch.stack([errors * bodies, errors * ~bodies]).mean((2, 3))
+    return (both + LEAST_ERROR).log().sum(0)
 
 
 def relative_gains(
