@@ -91,17 +91,17 @@ def propose(
         before: measurement of ``base``.
     """
     psnr, seconds = before
-    table, chosen, lost, saved, put_back = [], {}, {}, {}, {}
+    table, chosen, lost, saved, put_back, known = [], {}, {}, {}, {}, {base: before}
     for effect, specs in settings.items():
         for name, spec in specs:
-            now, duration = trial(spec)
+            now, duration = known[spec] = trial(spec)
             fits = psnr - now <= tolerance
             if effect not in chosen and fits and duration <= seconds:
                 chosen[effect], lost[effect], saved[effect] = spec, psnr - now, seconds - duration
             table.append((effect, name, psnr - now, seconds - duration, chosen.get(effect) is spec, fits))
     while True:
         spec = combined(base, chosen.values())
-        now, duration = trial(spec) if chosen else before
+        now, duration = known[spec] if spec in known else trial(spec)
         if psnr - now > tolerance:
             back, why = max(chosen, key=lost.get), "too much with the others"
         elif duration > seconds:
