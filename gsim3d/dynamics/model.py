@@ -244,7 +244,7 @@ class Dynamics(nn.Module):
         if self.config.graph is not None:
             columns.insert(0, (relative_positions(ctx.history) / self.config.grid_size).to(columns[0]))
         for width, features in (("n_conv_features", "conv_features"), ("n_features", "features")):
-            for prior in sorted(self.priors, key=lambda prior: prior.behind_norm):
+            for prior in self.priors:
                 if n := getattr(prior, width):
                     made = None if ctx.is_empty else getattr(prior, features)(ctx)
                     columns.append(columns[0].new_zeros(len(columns[0]), n) if made is None else made)

@@ -123,8 +123,8 @@ def combined(base: EffectsSpec, specs: Iterable[EffectsSpec]) -> EffectsSpec:
     for other in specs:
         for group in (field.name for field in fields(base)):
             mine, theirs = getattr(base, group), getattr(other, group)
-            values = {field.name: getattr(theirs, field.name) for field in fields(mine)}
-            changed = {name: value for name, value in values.items() if value != getattr(mine, name)}
+            names = (field.name for field in fields(mine))
+            changed = {name: x for name in names if (x := getattr(theirs, name)) != getattr(mine, name)}
             spec = replace(spec, **{group: replace(getattr(spec, group), **changed)})
     return spec
 

@@ -117,7 +117,6 @@ class Extension(Protocol):
 
     conv_proj: SparseConv | None  #: convolution of further inputs into the stem; None: there are none
     in_proj: RowLinear | None  #: product of inputs that are not convolved
-    hidden_proj: RowLinear | None  #: product of inputs that join behind the stem's norm
     gain_head: RowLinear | None  #: product of the last hidden channels, for further outputs
 
 
@@ -296,8 +295,7 @@ def run_blocks(
 
 
 class Stem(nn.Module):
-    """Features of the particles -> channels of stage 0: own ones and those of extensions that are convolved, then those
-    of extensions that are not, and those that join behind the norm."""
+    """Features of the particles -> channels of stage 0; own ones first, then those of extensions, convolved or not."""
 
     def __init__(self, in_channels: int, config: TransformerConfig, extensions: Sequence[Extension] = ()):
         super().__init__()
@@ -305,21 +303,17 @@ class Stem(nn.Module):
         self.conv = SparseConv(in_channels, channels, STEM_KERNEL, bias=False)
         self.conv.extensions = tuple(of.conv_proj for of in extensions if of.conv_proj is not None)
         self._in_projs = tuple(of.in_proj for of in extensions if of.in_proj is not None)
-        self._hidden_projs = tuple(of.hidden_proj for of in extensions if of.hidden_proj is not None)
         self.norm = make_norm(config.norm, channels)
 
     def forward(self, x: Tensor, stage: Stage, context: FrozenContext | None = None) -> Tensor:
-        n, n_hidden = (sum(of.in_features for of in projs) for projs in (self._in_projs, self._hidden_projs))
-        x, others, hidden = x.split([x.shape[1] - n - n_hidden, n, n_hidden], 1)
+        n = sum(linear.in_features for linear in self._in_projs)
+        x, others = x.split([x.shape[1] - n, n], 1)
         x = self.conv(x.contiguous(), stage, context)
-        x = self.norm.activated(x + _projected(others, self._in_projs) if n else x, stage.n_data)
-        return x + _projected(hidden, self._hidden_projs) if n_hidden else x
-
-
-def _projected(x: Tensor, linears: Sequence[RowLinear]) -> Tensor:
-    sides = [x], [linear.weight for linear in linears]
-    zeros = (cached_zero(of[0].dtype, x.device).expand(len(of[0]), -x.shape[1] % COLUMN_MULTIPLE) for of in sides)
-    return row_linear(*(torch.cat([*of, zero], 1) for of, zero in zip(sides, zeros, strict=True)), None)
+        if n:
+            sides = [others], [linear.weight for linear in self._in_projs]
+            zeros = (cached_zero(of[0].dtype, x.device).expand(len(of[0]), -n % COLUMN_MULTIPLE) for of in sides)
+            x = x + row_linear(*(torch.cat([*of, zero], 1) for of, zero in zip(sides, zeros, strict=True)), None)
+        return self.norm.activated(x, stage.n_data)
 
 
 class Pool(nn.Module):

@@ -179,7 +179,6 @@ class Prior(nn.Module):
         requires: types of priors that must precede it in the list.
         n_conv_features: channels of :meth:`conv_features`.
         n_features: channels of :meth:`features`.
-        behind_norm: whether these join behind the norm of the stem, before which small ones vanish beside latents.
         n_gains: channels of gains that the network predicts for it.
         gains_change: attribute that the gains change; they are not computed if a plan keeps it constant.
         replaces_displacement: whether the network predicts gains only, and no displacement.
@@ -192,7 +191,7 @@ class Prior(nn.Module):
     requires: tuple[str, ...] = ()
     n_conv_features = n_features = n_gains = 0
     gains_change = "means"
-    behind_norm = replaces_displacement = latent_only = reads_background = is_local = False
+    replaces_displacement = latent_only = reads_background = is_local = False
 
     def __init_subclass__(cls, config: type[PriorConfig] | None = None, **kwargs):
         super().__init_subclass__(**kwargs)
@@ -204,7 +203,7 @@ class Prior(nn.Module):
     def __init__(self, config: PriorConfig):
         super().__init__()
         self.config, self.name = config, config.type
-        self.conv_proj = self.in_proj = self.hidden_proj = self.gain_head = None
+        self.conv_proj = self.in_proj = self.gain_head = None
 
     @property
     def acts(self) -> bool:
@@ -216,11 +215,10 @@ class Prior(nn.Module):
         if self.n_conv_features:
             self.conv_proj = SparseConv(self.n_conv_features, stem_channels, STEM_KERNEL, bias=False)
         if self.n_features:
-            name = "hidden_proj" if self.behind_norm else "in_proj"
-            setattr(self, name, RowLinear(self.n_features, stem_channels, bias=False))
+            self.in_proj = RowLinear(self.n_features, stem_channels, bias=False)
         if self.n_gains:
             self.gain_head = RowLinear(head_channels, self.n_gains)
-        for linear in (self.conv_proj, self.in_proj, self.hidden_proj, self.gain_head):
+        for linear in (self.conv_proj, self.in_proj, self.gain_head):
             for parameter in () if linear is None else linear.parameters():
                 nn.init.zeros_(parameter)
 

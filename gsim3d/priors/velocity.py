@@ -12,7 +12,6 @@ from gsim3d.priors.padding import PaddedClouds, Samples, Subset, mean_shift
 from gsim3d.state import Particles, constant
 
 SMOOTHING = 0.5  # share of the old mean velocity in the new one
-SLOW = 16  # a cell over the displacement in a step up to which features are about proportional: rolls count, too
 
 
 @dataclass(frozen=True)
@@ -24,27 +23,25 @@ class VelocityConfig(PriorConfig):
     """
 
     type = "velocity"
-    version: int = 2
+    version: int = 3
     radius: float = 0.3
 
     RANGES = {"radius": (1e-6, 1e6)}
 
 
 class Velocity(Prior, config=VelocityConfig):
-    """Features of the newest particles: asinh(SLOW v / cell) of the last displacement v_1 and the mean velocity v_2.
-    Predicted gains g [2, 3] add g_1 v_1 + (1 + g_2) v_2 (elementwise) to a displacement.
+    """Adds g_1 v_1 + (1 + g_2) v_2 (elementwise) to a displacement, of the last displacement v_1, the mean velocity v_2
+    and gains g [2, 3]: the network predicts changes, as graph network simulators do (Sanchez-Gonzalez et al. 2020).
 
-    The network then predicts changes of velocities, as graph network simulators do (Sanchez-Gonzalez et al. 2020), and
-    reads motions below a cell, to which it rounds positions. In encoded clouds v_1 is the displacement of the mean of a
-    particle's window since the cloud before, and v_2 the slope of the line through the means in all clouds of the
-    history, which has less noise; with ``velocity_from_images`` before it in the list, what that has found, spins, too.
-    A step with displacement d changes v_2 to (v_2 + d) / 2, which lags behind by 1.5 steps, as that of four encoded
-    clouds. Gradients flow through displacements, not through encoded velocities.
+    In encoded clouds v_1 is the displacement of the mean of a particle's window since the cloud before, and v_2 the
+    slope of the line through all, or what ``velocity_from_images`` before it in the list has found. A displacement d
+    changes v_2 to (v_2 + d) / 2, which lags behind by 1.5 steps, as that of four clouds. Gradients flow through
+    displacements, not through encoded velocities.
     """
 
     attributes = ("velocity", "mean_velocity")
-    n_features = n_gains = 6
-    behind_norm = is_local = True
+    n_gains = 6
+    is_local = True
 
     def initialize(self, particles: Particles, ctx: StepContext, frames: Frames | None = None) -> Particles:
         if frames is None or ctx.is_empty:
@@ -52,10 +49,6 @@ class Velocity(Prior, config=VelocityConfig):
         last, mean = map(ctx.scatter_newest, window_velocities(ctx, self.config.radius))
         mean = mean if ctx.priors.get("velocity_from_images") is None else particles.velocity
         return replace(particles, velocity=last, mean_velocity=mean)
-
-    def features(self, ctx: StepContext) -> Tensor:
-        both = torch.cat([ctx.state.velocity, ctx.state.mean_velocity], 1)
-        return ctx.scatter_newest((both * (SLOW / ctx.grid_size)).asinh())
 
     def move(self, motion: Motion, gains: Tensor, ctx: StepContext) -> Motion:
         g_1, g_2 = bounded_gains(gains).unbind(1)

@@ -8,7 +8,7 @@ from gsim3d.evaluate.perceptual.lpips import LPIPS
 from gsim3d.train.config import LossConfig
 
 MAX_GAIN = 1.5
-LEAST_ERROR = 1e-5  # added to the errors whose logarithm is taken: 50 dB
+LEAST_ERROR = 1e-5  # that a logarithm is taken of: 50 dB
 LEAST_WEIGHT = 1e-12  # lower bound of the total pixel weight of an image, so that empty images have error 0
 
 
@@ -31,8 +31,8 @@ def training_loss(
     if settings.image_gain:
         images = images * relative_gains(images.detach(), truth, targets.cameras, n_steps, weight)
     step = targets.cameras.image_cloud % n_steps
-    if settings.relative and shown is not None:
-        wrong = relative_errors(images, truth, shown, targets.valid)
+    if settings.relative:
+        wrong = relative_errors(images, truth, shown, settings.body_weight, targets.valid)
     else:
         wrong = image_errors(images, truth, weight)
     if perceptual is not None:
@@ -54,9 +54,7 @@ def time_weights(n_past: int, n_future: int, *, balance: float = 0.5, discount: 
     """
     if n_past < 1 or n_future < 0:
         raise ValueError(f"time_weights: must have n_past >= 1 and n_future >= 0; got {n_past}, {n_future}")
-    if n_future == 0:
-        return torch.full((n_past,), 1 / n_past)
-    past = torch.full((n_past,), (1 - balance) / n_past)
+    past = torch.full((n_past,), (1 - balance * (n_future > 0)) / n_past)
     return torch.cat([past, balance * discount ** torch.arange(n_future, dtype=torch.float32)])
 
 
@@ -68,13 +66,16 @@ def image_errors(pred: Tensor, target: Tensor, weight: Tensor | None = None) -> 
     return (errors * weight).sum((1, 2)) / weight.sum((1, 2)).clamp(min=LEAST_WEIGHT)
 
 
-def relative_errors(pred: Tensor, target: Tensor, bodies: Tensor, valid: Tensor | None = None) -> Tensor:
-    """Returns the sum [I] of the logarithms of the squared errors on ``bodies`` (bool [I, H, W]) and elsewhere, each a
-    mean over all pixels of the image, of images [I, H, W, C]; only ``valid`` pixels (bool [I, H, W]) are compared."""
+def relative_errors(
+    pred: Tensor, target: Tensor, bodies: Tensor | None, body_weight: float = 0.0, valid: Tensor | None = None
+) -> Tensor:
+    """Returns log(e_1 + LEAST_ERROR) + (1 + body_weight) log(e_2 + LEAST_ERROR) [I] of images [I, H, W, C]: e_2 is the
+    squared error of pixels on ``bodies`` (bool [I, H, W]), e_1 that of the others (None: of all), each a sum over its
+    pixels divided by all of the image. Pixels that are not ``valid`` (bool [I, H, W]) have none."""
     errors = (pred - target).square().mean(-1)
     errors = errors if valid is None else errors * valid
-    both = torch.stack([errors * bodies, errors * ~bodies]).mean((2, 3))
-    return (both + LEAST_ERROR).log().sum(0)
+    parts = [(1.0, errors)] if bodies is None else [(1.0, errors * ~bodies), (1 + body_weight, errors * bodies)]
+    return sum(share * (part.mean((1, 2)) + LEAST_ERROR).log() for share, part in parts)
 
 
 def relative_gains(
@@ -82,10 +83,9 @@ def relative_gains(
 ) -> Tensor:
     """Returns gains [I, 1, 1, C] of images [I, H, W, C], one for each camera of a scene, relative to the scene's mean.
 
-    A gain has the least error over all given images of one pose and scene (``cameras.image_cloud // n_steps``), in
-    training those of a whole window, also where gradients are cut. So errors that grow over time are not forgiven,
-    unless the camera moves. Gains lie between 1 / MAX_GAIN and MAX_GAIN. Without the division by their geometric mean
-    over the images of the scene, a model would not learn how bright it is.
+    A gain has the least error over all given images of a pose and scene (``cameras.image_cloud // n_steps``), of whole
+    windows in training. So errors that grow over time are not forgiven, unless the camera moves. Without the division
+    of gains (1 / MAX_GAIN to MAX_GAIN) by their geometric mean, a model would not learn how bright it is.
     """
     scene = cameras.image_cloud // n_steps
     same_scene = (scene[:, None] == scene)[..., None]
@@ -105,5 +105,4 @@ def mean_by_step(values: Tensor, step: Tensor, n_steps: int) -> Tensor:
 def image_loss(errors: Tensor, step: Tensor, weights: Tensor) -> Tensor:
     """Computes ``sum_t weights[t] * mean of errors at step t`` for the ``errors`` [I] of images at ``step`` int64 [I];
     ``weights`` [S] of :func:`time_weights`."""
-    by_step = mean_by_step(errors, step, weights.shape[0])
-    return (weights.to(by_step) * by_step).sum()
+    return (weights.to(errors) * mean_by_step(errors, step, weights.shape[0])).sum()

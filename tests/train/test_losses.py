@@ -5,7 +5,9 @@ import math
 import pytest
 import torch
 
-from gsim3d.train.losses import image_errors, image_loss, mean_by_step, time_weights
+from gsim3d.errors import InputError
+from gsim3d.train.config import LossConfig
+from gsim3d.train.losses import LEAST_ERROR, image_errors, image_loss, mean_by_step, relative_errors, time_weights
 from gsim3d.train.optimizer import one_cycle
 
 
@@ -43,6 +45,43 @@ def test_pixel_weights_make_a_weighted_mean():
     pred, target = torch.zeros(1, 1, 2, 3), torch.tensor([1.0, 3.0]).reshape(1, 1, 2, 1).expand(1, 1, 2, 3)
     assert image_errors(pred, target, torch.tensor([[[3.0, 1.0]]])).item() == pytest.approx((3 * 1 + 1 * 9) / 4)
     assert image_errors(pred, target, torch.ones(1, 1, 2)).item() == image_errors(pred, target).item()
+
+
+def test_relative_errors_by_hand():
+    pred, target = torch.zeros(2, 1, 4, 3), torch.tensor([1.0, 3.0, 2.0, 0.5]).reshape(1, 1, 4, 1).expand(2, 1, 4, 3)
+    bodies = torch.tensor([[[False, True, True, False]], [[False] * 4]])
+    valid = torch.tensor([[[True, True, False, True]], [[True] * 4]])
+
+    def log(*errors):
+        return math.log(sum(errors) / 4 + LEAST_ERROR)
+
+    expected = [log(1, 0.25) + 3 * log(9), log(1, 9, 4, 0.25) + 3 * log()]
+    assert relative_errors(pred, target, bodies, 2.0, valid).tolist() == pytest.approx(expected, rel=1e-6)
+    whole = [log(1, 9, 0.25), log(1, 9, 4, 0.25)]
+    assert relative_errors(pred, target, None, 2.0, valid).tolist() == pytest.approx(whole, rel=1e-6)
+
+
+def test_relative_gradients_count_well_predicted_images_alike():
+    off = torch.tensor([0.02, 0.2], dtype=torch.double).reshape(2, 1, 1, 1).expand(2, 8, 8, 3).clone().requires_grad_()
+    bodies = torch.zeros(2, 8, 8, dtype=torch.bool)
+    bodies[:, 2:6, 2:6] = True
+    loss = relative_errors(off, torch.zeros_like(off), bodies).sum()
+    (gradient,) = torch.autograd.grad(loss, off)
+    steps = (gradient * off).sum((2, 3)).detach()  # what a relative change of the error is worth
+    torch.testing.assert_close(steps[0].sum(), steps[1].sum(), rtol=0.1, atol=0)
+    assert torch.autograd.gradcheck(lambda x: relative_errors(x, torch.zeros_like(x), bodies, 1.0), off)
+
+
+def test_images_without_error_or_bodies_have_finite_gradients():
+    pred = torch.zeros(1, 4, 4, 3, requires_grad=True)
+    loss = relative_errors(pred, torch.zeros(1, 4, 4, 3), torch.zeros(1, 4, 4, dtype=torch.bool)).sum()
+    (gradient,) = torch.autograd.grad(loss, pred)
+    assert loss.isfinite() and not gradient.any()
+
+
+def test_relative_errors_have_no_perceptual_part():
+    with pytest.raises(InputError, match="loss.perceptual"):
+        LossConfig(relative=True, perceptual=0.05)
 
 
 def test_mean_by_step_of_a_step_without_images():
