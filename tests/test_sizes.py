@@ -12,8 +12,8 @@ SPEC.loader.exec_module(sizes)
 # What is still above its limit may shrink and not grow.
 TODAY = {
     "lines of the package": 46_019,
-    "lines of the library without io": 15_866,
-    "lines of readers, writers and the viewer": 4_490,
+    "lines of the library without io": 15_851,
+    "lines of readers, writers and the viewer": 4_485,
 }
 
 
