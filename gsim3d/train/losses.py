@@ -37,7 +37,8 @@ def training_loss(
         wrong = image_errors(images, truth, weight)
     if perceptual is not None:
         seen = images if targets.valid is None else torch.where(targets.valid[..., None], images, truth)
-        wrong = wrong + settings.perceptual * perceptual(seen.permute(0, 3, 1, 2), targets.images)
+        distance = perceptual(seen.permute(0, 3, 1, 2), targets.images)
+        wrong = wrong + settings.perceptual * ((distance + LEAST_ERROR).log() if settings.relative else distance)
     with torch.no_grad():
         errors = mean_by_step(image_errors(images, truth, targets.valid), step, n_steps)
     return image_loss(wrong, step, weights), errors

@@ -1,13 +1,22 @@
 """The loss and the learning-rate schedule."""
 
+import dataclasses
 import math
 
 import pytest
 import torch
 
-from gsim3d.errors import InputError
+from gsim3d.cameras import Cameras, Frames
 from gsim3d.train.config import LossConfig
-from gsim3d.train.losses import LEAST_ERROR, image_errors, image_loss, mean_by_step, relative_errors, time_weights
+from gsim3d.train.losses import (
+    LEAST_ERROR,
+    image_errors,
+    image_loss,
+    mean_by_step,
+    relative_errors,
+    time_weights,
+    training_loss,
+)
 from gsim3d.train.optimizer import one_cycle
 
 
@@ -79,9 +88,18 @@ def test_images_without_error_or_bodies_have_finite_gradients():
     assert loss.isfinite() and not gradient.any()
 
 
-def test_relative_errors_have_no_perceptual_part():
-    with pytest.raises(InputError, match="loss.perceptual"):
-        LossConfig(relative=True, perceptual=0.05)
+@pytest.mark.parametrize("relative", [False, True])
+def test_perceptual_distances_are_added(relative):
+    images, truth, distances = torch.rand(4, 8, 8, 3), torch.rand(4, 3, 8, 8), torch.tensor([0.1, 0.2, 0.3, 0.4])
+    cameras = Cameras(*torch.eye(4).expand(2, 4, 4, 4), *torch.ones(2, 4), torch.arange(4) % 2, 8, 8)
+    targets = Frames(truth, cameras, torch.zeros(2).long(), torch.arange(2), torch.zeros(1, 3))
+    settings = LossConfig(relative=relative, body_weight=1.0, perceptual=0.5)
+    weights = torch.tensor([1.0, 2.0])
+    plain, _ = training_loss(dataclasses.replace(settings, perceptual=0.0), None, images, targets, weights)
+    loss, _ = training_loss(settings, lambda seen, other: distances, images, targets, weights)
+    added = (distances + LEAST_ERROR).log() if relative else distances
+    expected = 0.5 * ((added[0] + added[2]) / 2 + 2 * (added[1] + added[3]) / 2)
+    assert (loss - plain).item() == pytest.approx(expected.item(), rel=1e-4)
 
 
 def test_mean_by_step_of_a_step_without_images():
