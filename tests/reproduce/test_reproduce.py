@@ -196,6 +196,7 @@ def test_fitted_methods_are_rows(work, tmp_path, monkeypatch, no_curves):
     monkeypatch.setitem(BASELINES, "spring-gaus", dataclasses.replace(BASELINES["spring-gaus"], **few))
     fitted = [dataclasses.replace(entry, device=None) for entry in ENTRIES[:2]]
     monkeypatch.setattr(run, "ENTRIES", fitted)
+    monkeypatch.setenv("GSIM3D_CACHE_DIR", str(tmp_path / "no weights"))  # of LPIPS, which is scored where it is there
     _, lines, _ = made(work, tmp_path / "out", trajectories=1)
     row = lines[MAIN, "spring-gaus"]
     assert row["numbers"]["future.psnr_masked"] > 10 and row["seed"] is None
