@@ -124,7 +124,7 @@ def combined(base: EffectsSpec, specs: Iterable[EffectsSpec]) -> EffectsSpec:
         for group in (field.name for field in fields(base)):
             mine, theirs = getattr(base, group), getattr(other, group)
             names = (field.name for field in fields(mine))
-            changed = {name: x for name in names if (x := getattr(theirs, name)) != getattr(mine, name)}
+            changed = {name: value for name in names if (value := getattr(theirs, name)) != getattr(mine, name)}
             spec = replace(spec, **{group: replace(getattr(spec, group), **changed)})
     return spec
 

@@ -125,7 +125,7 @@ class LossConfig:
     balance: float = 0.5
     discount: float = 0.87  #: weight of a simulated step relative to the previous one, 0 to 1 (gamma of the paper)
     body_weight: float = 0.0  #: weight added to pixels of movable bodies; other pixels have weight 1
-    #: logarithms: of the errors on bodies, times 1 + body_weight, and elsewhere, as in PSNR; of LPIPS, times perceptual
+    #: sum logarithms, as in PSNR: of errors on bodies (times 1 + body_weight), elsewhere, of LPIPS (times perceptual)
     relative: bool = False
     #: weight of LPIPS (VGG), added to the squared error; 0.05 in the paper, 0.01 for its rigid bodies. Install its
     #: weights with `gsim3d weights lpips`.

@@ -8,7 +8,7 @@ from gsim3d.evaluate.perceptual.lpips import LPIPS
 from gsim3d.train.config import LossConfig
 
 MAX_GAIN = 1.5
-LEAST_ERROR = 1e-5  # that a logarithm is taken of: 50 dB
+LEAST_ERROR = 1e-5  # added before a logarithm; 50 dB
 LEAST_WEIGHT = 1e-12  # lower bound of the total pixel weight of an image, so that empty images have error 0
 
 

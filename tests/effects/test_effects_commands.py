@@ -124,6 +124,18 @@ def test_propose_puts_back_most_valuable_effect():
     assert notes["changing", "none"] == ("+0.030", "proposed")
 
 
+def test_propose_measures_no_specification_twice():
+    model, base, seen = presets.paper_latent(2), EffectsSpec(), []
+
+    def trial(spec):
+        seen.append(spec)
+        return 30.0 - (spec.dynamics.history != 1), 1.0  # one step alone is as good
+
+    _, spec, _ = propose(base, smaller_settings(base, model), trial, (30.0, 1.0), 0.1)
+    assert spec.dynamics.history == 1
+    assert base not in seen and all(seen.count(spec) == 1 for spec in seen)
+
+
 def timed(cost):
     """Proposes from presets.paper_latent where a spec takes ``cost`` (spec) seconds and all are as good."""
     model, base = presets.paper_latent(2), EffectsSpec()
